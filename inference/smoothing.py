@@ -1,0 +1,207 @@
+"""Completion of demonstrations: exact expectations over hidden steps, and samplers of the same posterior.
+
+``exact`` is the default. ``blocked`` (joint backward sampling) and ``gibbs`` (single-site) estimate the
+same quantities from ``n`` draws, the ``n_s`` that Lemma 2 counts.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ..models.chain import Smoothed, filter_forward, sample_backward, smooth
+from ..models.demonstration import PAD, Demonstration
+from ..models.evidence import Imperfection, log_evidence
+from ..models.mdp import TabularMDP
+
+
+class Evidence(NamedTuple):
+    """A demonstration as a learner uses it: ``log e_t(s, a)`` as ``[n, L, S, A]`` and which steps exist."""
+
+    log_evidence: Float[Array, "n L S A"]
+    live: Bool[Array, "n L"]
+
+
+class Expectations(NamedTuple):
+    """Expected sufficient statistics of a demonstration, hidden steps averaged over their posterior.
+
+    Fields
+    ------
+    log_likelihood : float ``[n]``
+        Of each trajectory.
+    counts : float ``[S, A]``
+        ``N(s, a)``, expected visits summed over trajectories and steps.
+    features : float ``[K]``
+        ``sum_n sum_t gamma^t E[phi(s_t, a_t)]`` (the numerator of Eq. 4.1).
+    start : float ``[S]``
+        Summed posterior of the first state.
+    tail : float ``[S]``
+        Summed posterior of the state after the last step, each weighted by ``gamma^L``.
+    size : float
+        Number of trajectories (padding rows excluded).
+    """
+
+    log_likelihood: Float[Array, " n"]
+    counts: Float[Array, "S A"]
+    features: Float[Array, " K"]
+    start: Float[Array, " S"]
+    tail: Float[Array, " S"]
+    size: Float[Array, ""]
+
+
+def evidence_of(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> Evidence:
+    """Evaluate a sensor on a demonstration once, for all passes over it."""
+    return Evidence(log_evidence(sensor, mdp, demonstration), jnp.asarray(demonstration.kind) != PAD)
+
+
+def smooth_all(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Smoothed:
+    """Forward-backward over every trajectory; fields as in :class:`Smoothed` with a leading ``n``."""
+    return jax.vmap(lambda e, live: smooth(mdp, e + log_policy, live))(*evidence)
+
+
+def log_likelihoods(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Float[Array, " n"]:
+    """Exact log-likelihood of each trajectory."""
+    return jax.vmap(lambda e, live: filter_forward(mdp, e + log_policy, live).log_likelihood)(*evidence)
+
+
+def expectations(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Expectations:
+    """The exact E-step (Eq. 4.1 with the sum over completions carried out)."""
+    posterior = smooth_all(mdp, log_policy, evidence)
+    return _collect(mdp, posterior.pairs, posterior.final, posterior.log_likelihood, evidence.live)
+
+
+def _collect(
+    mdp: TabularMDP,
+    pairs: Float[Array, "n L S A"],
+    final: Float[Array, "n S"],
+    log_likelihood: Float[Array, " n"],
+    live: Bool[Array, "n L"],
+) -> Expectations:
+    powers = mdp.discount ** jnp.arange(live.shape[1])
+    exists = jnp.any(live, axis=1)
+    discounted = jnp.einsum("nlsa,l->sa", pairs, powers)
+    weight = jnp.where(exists, mdp.discount ** jnp.sum(live, axis=1), 0.0)
+    return Expectations(
+        log_likelihood=log_likelihood,
+        counts=jnp.sum(pairs, axis=(0, 1)),
+        features=jnp.einsum("sa,sak->k", discounted, mdp.features),
+        start=jnp.sum(pairs[:, 0], axis=(0, 2)),
+        tail=jnp.einsum("n,ns->s", weight, final),
+        size=jnp.sum(exists).astype(float),
+    )
+
+
+def sample_completions(
+    key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, draws: int
+) -> tuple[Int[Array, "draws n L"], Int[Array, "draws n L"]]:
+    """Independent joint completions (states, actions) by backward sampling; -1 on padding."""
+
+    def one(key: Array, e: Array, live: Array) -> tuple:
+        factors = e + log_policy
+        filtered = filter_forward(mdp, factors, live)
+        keys = jax.random.split(key, draws)
+        return jax.vmap(lambda k: sample_backward(k, mdp, factors, filtered, live))(keys)
+
+    keys = jax.random.split(key, evidence.live.shape[0])
+    return jax.vmap(one, out_axes=1)(keys, *evidence)
+
+
+def blocked_expectations(
+    key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, draws: int
+) -> Expectations:
+    """:func:`expectations` estimated from ``draws`` independent joint completions."""
+    states, actions = sample_completions(key, mdp, log_policy, evidence, draws)
+    return _from_completions(mdp, log_policy, evidence, states, actions)
+
+
+def gibbs_expectations(
+    key: Array,
+    mdp: TabularMDP,
+    log_policy: Float[Array, "S A"],
+    evidence: Evidence,
+    draws: int,
+    burn_in: int = 20,
+) -> Expectations:
+    """:func:`expectations` estimated by ``draws`` sweeps of the single-site Gibbs sampler."""
+    states, actions = gibbs_completions(key, mdp, log_policy, evidence, draws, burn_in)
+    return _from_completions(mdp, log_policy, evidence, states, actions)
+
+
+def gibbs_completions(
+    key: Array,
+    mdp: TabularMDP,
+    log_policy: Float[Array, "S A"],
+    evidence: Evidence,
+    draws: int,
+    burn_in: int = 20,
+) -> tuple[Int[Array, "draws n L"], Int[Array, "draws n L"]]:
+    """Completions by single-site Gibbs: each sweep redraws every state, then its action, given both neighbours.
+
+    The dissertation's MCMC. Unlike its released code, the look-ahead factor ``P(s_{t+1} | s_t, a_t)``
+    enters at every step. Where the dynamics are nearly deterministic a single site cannot move, so it
+    mixes poorly or not at all: an inherent limit of the sampler, and why it is not the default. The chain
+    starts from a completion drawn under the uniform policy.
+    """
+    n_states = mdp.n_states
+    uniform = jnp.where(mdp.available, 0.0, -jnp.inf)
+    log_initial = jnp.log(mdp.initial)
+
+    def chain(key: Array, e: Array, live: Array) -> tuple:
+        length = live.shape[0]
+        start_key, key = jax.random.split(key)
+        filtered = filter_forward(mdp, e + uniform, live)
+        states, actions = sample_backward(start_key, mdp, e + uniform, filtered, live)
+        last = jnp.sum(live) - 1
+
+        def site(carry: tuple, inputs: tuple) -> tuple:
+            states, actions = carry
+            t, key = inputs
+            state_key, action_key = jax.random.split(key)
+            before = states[jnp.maximum(t - 1, 0)], actions[jnp.maximum(t - 1, 0)]
+            arrive = jnp.zeros(n_states).at[mdp.successors[before]].add(mdp.probabilities[before])
+            arrive = jnp.where(t == 0, log_initial, jnp.log(arrive))
+            leave = jnp.log(mdp.transition_probability(states[jnp.minimum(t + 1, length - 1)]))
+            onward = jnp.where(t < last, leave, 0.0)
+            joint = arrive[:, None] + log_policy + e[t] + onward
+            state = jax.random.categorical(state_key, joint[:, actions[t]])
+            action = jax.random.categorical(action_key, joint[state])
+            alive = live[t]
+            states = states.at[t].set(jnp.where(alive, state, states[t]))
+            actions = actions.at[t].set(jnp.where(alive, action, actions[t]))
+            return (states, actions), None
+
+        def sweep(carry: tuple, key: Array) -> tuple:
+            carry, _ = lax.scan(site, carry, (jnp.arange(length), jax.random.split(key, length)))
+            return carry, carry
+
+        _, (states, actions) = lax.scan(sweep, (states, actions), jax.random.split(key, draws + burn_in))
+        return states[burn_in:], actions[burn_in:]
+
+    keys = jax.random.split(key, evidence.live.shape[0])
+    return jax.vmap(chain, out_axes=1)(keys, *evidence)
+
+
+def _from_completions(
+    mdp: TabularMDP,
+    log_policy: Float[Array, "S A"],
+    evidence: Evidence,
+    states: Int[Array, "draws n L"],
+    actions: Int[Array, "draws n L"],
+) -> Expectations:
+    draws = states.shape[0]
+    n, length = evidence.live.shape
+
+    def average(states: Array, actions: Array) -> Array:
+        hits = jnp.zeros((length, mdp.n_states, mdp.n_actions))
+        steps = jnp.broadcast_to(jnp.arange(length), (draws, length))
+        return hits.at[steps, states, actions].add(1.0 / draws)
+
+    pairs = jax.vmap(average, in_axes=1)(states, actions)
+    pairs = jnp.where(evidence.live[..., None, None], pairs, 0.0)
+    last = jnp.maximum(jnp.sum(evidence.live, axis=1) - 1, 0)
+    final = jax.vmap(mdp.push_forward)(pairs[jnp.arange(n), last])
+    return _collect(mdp, pairs, final, log_likelihoods(mdp, log_policy, evidence), evidence.live)

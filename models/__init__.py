@@ -1,0 +1,73 @@
+"""What is believed: decision processes, demonstrations, evidence, and the law of a trajectory.
+
+Importing this package switches JAX to 64-bit floats: likelihoods of long trajectories and warm-started
+programs need the digits.
+"""
+
+import jax
+
+jax.config.update("jax_enable_x64", True)
+
+from .demonstration import (
+    Demonstration,
+    DemonstrationError,
+    Record,
+    concatenate,
+    read_trajectories,
+    write_trajectories,
+)
+from .evidence import Imperfection, ObservationModel, Sensor, Visibility, log_evidence, require_possible
+from .mdp import TabularMDP
+from .planning import (
+    FinitePlan,
+    HardPlan,
+    SoftPlan,
+    deterministic_policy,
+    feature_expectations,
+    features_to_go,
+    finite_hard_plan,
+    finite_occupancy,
+    finite_soft_plan,
+    hard_plan,
+    occupancy,
+    policy_values,
+    reachable_states,
+    reward_of,
+    simulate,
+    soft_plan,
+)
+from .trajectory import TrajectoryLaw, sample_demonstration
+
+__all__ = [
+    "Demonstration",
+    "DemonstrationError",
+    "FinitePlan",
+    "HardPlan",
+    "Imperfection",
+    "ObservationModel",
+    "Record",
+    "Sensor",
+    "SoftPlan",
+    "TabularMDP",
+    "TrajectoryLaw",
+    "Visibility",
+    "concatenate",
+    "deterministic_policy",
+    "feature_expectations",
+    "features_to_go",
+    "finite_hard_plan",
+    "finite_occupancy",
+    "finite_soft_plan",
+    "hard_plan",
+    "log_evidence",
+    "occupancy",
+    "policy_values",
+    "reachable_states",
+    "read_trajectories",
+    "require_possible",
+    "reward_of",
+    "sample_demonstration",
+    "simulate",
+    "soft_plan",
+    "write_trajectories",
+]

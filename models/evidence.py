@@ -1,0 +1,258 @@
+"""Imperfect perception, as evidence about hidden state-action pairs.
+
+Whatever a learner perceived at a step, the imperfection turns it into ``e_t(s, a)``, the probability of
+perceiving just that if the truth were ``(s, a)``. A sensor has two factors: *presence* (was the step in
+view at all?) and *reading* (what did perception report of a step in view?). Imperfections supply one or
+both and compose with ``*``.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from .demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
+from .mdp import TabularMDP, _PairNames
+
+
+class Imperfection(Protocol):
+    """Anything that turns what was perceived into evidence; methods never ask which one they were given."""
+
+    @property
+    def presence(self) -> Float[Array, " S"] | None:
+        """Probability that a step in each state is in view; None means always."""
+
+    @property
+    def reading(self) -> ObservationModel | None:
+        """What perception reports of a step in view; None means exactly the truth."""
+
+
+class _Composable:
+    """Products of imperfections."""
+
+    def __mul__(self: Imperfection, other: Imperfection) -> Sensor:  # type: ignore[misc]
+        if self.reading is not None and other.reading is not None:
+            raise ValueError("a sensor has one reading: two observation models cannot be multiplied")
+        if self.presence is None or other.presence is None:
+            presence = self.presence if other.presence is None else other.presence
+        else:
+            presence = self.presence * other.presence
+        return Sensor(presence, self.reading if other.reading is None else other.reading)
+
+
+class _SensorFields(NamedTuple):
+    presence: Float[Array, " S"] | None = None
+    reading: ObservationModel | None = None
+
+
+class Sensor(_Composable, _SensorFields):  # type: ignore[misc]
+    """A product of imperfections; ``Sensor()`` sees everything exactly."""
+
+    __slots__ = ()
+
+
+class _VisibilityFields(NamedTuple):
+    in_view: Float[Array, " S"]
+
+
+class Visibility(_Composable, _VisibilityFields):  # type: ignore[misc]
+    """A view that covers some states: ``in_view[s]`` is the probability of seeing a step in ``s``.
+
+    A boolean mask is the usual case. A step that is not seen is evidence that the expert is out of view.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, in_view: np.ndarray | Array) -> Visibility:
+        """Check and convert ``in_view``; ``ValueError`` if it is no probability."""
+        if not isinstance(in_view, jax.core.Tracer) and not isinstance(in_view, jax.Array):
+            array = np.asarray(in_view, dtype=float)
+            if array.ndim != 1 or not ((array >= 0) & (array <= 1)).all():
+                raise ValueError(f"in_view must be a mask or probabilities of shape [S], got shape {array.shape}")
+            in_view = jnp.asarray(array)
+        return super().__new__(cls, in_view)  # type: ignore[call-arg]
+
+    @property
+    def presence(self) -> Float[Array, " S"]:
+        """The view itself."""
+        return self.in_view
+
+    @property
+    def reading(self) -> None:
+        """What is in view is seen exactly."""
+        return None
+
+
+class _ObservationFields(NamedTuple):
+    log_probabilities: Float[Array, "S A S A"]
+
+
+class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
+    """A full confusion of pairs: ``log O(o_s, o_a | s, a)`` as ``[S, A, S, A]``, truth first.
+
+    Build it from probabilities with :meth:`from_probabilities`, or from independent confusions of states
+    ``[S, S]`` and actions ``[A, A]`` with :meth:`from_factors`.
+    """
+
+    __slots__ = ()
+
+    @staticmethod
+    def from_probabilities(probabilities: np.ndarray) -> ObservationModel:
+        """From ``O(o | s, a)`` as ``[S, A, S, A]``; ``ValueError`` unless each truth's row sums to one."""
+        o = np.asarray(probabilities, dtype=float)
+        if o.ndim != 4 or o.shape[:2] != o.shape[2:]:
+            raise ValueError(f"an observation model has shape [S, A, S, A], truth first, got {o.shape}")
+        if not np.isfinite(o).all() or (o < 0).any():
+            raise ValueError("observation probabilities must be non-negative numbers")
+        total = o.sum((2, 3))
+        if np.abs(total - 1).max() > 1e-8:
+            s, a = np.unravel_index(np.abs(total - 1).argmax(), total.shape)
+            raise ValueError(f"observation probabilities of pair ({s}, {a}) sum to {total[s, a]}, not 1")
+        with np.errstate(divide="ignore"):
+            return ObservationModel(jnp.asarray(np.log(o)))
+
+    @staticmethod
+    def from_factors(states: np.ndarray, actions: np.ndarray) -> ObservationModel:
+        """States and actions confused independently: ``O = O_s(o_s | s) O_a(o_a | a)``."""
+        return ObservationModel.from_probabilities(np.einsum("so,ap->saop", np.asarray(states), np.asarray(actions)))
+
+    @property
+    def presence(self) -> None:
+        """Noise hides nothing."""
+        return None
+
+    @property
+    def reading(self) -> ObservationModel:
+        """The model itself."""
+        return self
+
+    def log_likelihood(
+        self, state: Int[Array, ""], action: Int[Array, ""], score: Float[Array, ""]
+    ) -> Float[Array, "S A"]:
+        """``log O(o | s, a)`` of one report, for every truth; an unreported coordinate is summed out."""
+        del score  # a fixed confusion takes no account of confidence
+        table = self.log_probabilities
+        by_state = jnp.where(
+            state == UNKNOWN, jax.nn.logsumexp(table, axis=2), table[:, :, jnp.maximum(state, 0)]
+        )
+        return jnp.where(action == UNKNOWN, jax.nn.logsumexp(by_state, axis=2), by_state[:, :, action])
+
+    def report(
+        self, key: Array, state: Int[Array, ""], action: Int[Array, ""]
+    ) -> tuple[Int[Array, ""], Int[Array, ""]]:
+        """Draw what perception reports of a pair."""
+        flat = jax.random.categorical(key, self.log_probabilities[state, action].reshape(-1))
+        n_actions = self.log_probabilities.shape[1]
+        return flat // n_actions, flat % n_actions
+
+
+def step_log_evidence(
+    sensor: Imperfection,
+    n_states: int,
+    n_actions: int,
+    kind: Int[Array, ""],
+    state: Int[Array, ""],
+    action: Int[Array, ""],
+    score: Float[Array, ""],
+) -> Float[Array, "S A"]:
+    """``log e_t(s, a)`` of one step; zero (no evidence) for lost frames and padding."""
+    shape = (n_states, n_actions)
+    presence = jnp.ones(n_states) if sensor.presence is None else sensor.presence
+    if sensor.reading is None:
+        match_state = (state == UNKNOWN) | (jnp.arange(n_states) == state)
+        match_action = (action == UNKNOWN) | (jnp.arange(n_actions) == action)
+        reading = jnp.where(match_state[:, None] & match_action, 0.0, -jnp.inf)
+    else:
+        reading = sensor.reading.log_likelihood(state, action, score)
+    seen = reading + _log(presence)[:, None]
+    hidden = jnp.broadcast_to(_log(1 - presence)[:, None], shape)
+    return jnp.where(kind == SEEN, seen, jnp.where(kind == HIDDEN, hidden, jnp.zeros(shape)))
+
+
+def _log(probability: Array) -> Array:
+    """Logarithm with ``log 0 = -inf`` and a zero, not NaN, gradient there."""
+    return jnp.where(probability > 0, jnp.log(jnp.where(probability > 0, probability, 1.0)), -jnp.inf)
+
+
+def log_evidence(sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration) -> Float[Array, "n L S A"]:
+    """``log e_t(s, a)`` of every step of every trajectory."""
+    step = jax.vmap(jax.vmap(lambda *x: step_log_evidence(sensor, mdp.n_states, mdp.n_actions, *x)))
+    kind, state, action, score = (jnp.asarray(x) for x in demonstration)
+    return step(kind, state, action, score)
+
+
+def observe(
+    key: Array, sensor: Imperfection, states: Int[Array, " L"], actions: Int[Array, " L"]
+) -> Int[Array, "L 3"]:
+    """Pass a true trajectory through a sensor: codes (kind, state, action) of what is perceived."""
+
+    def one(key: Array, state: Int[Array, ""], action: Int[Array, ""]) -> Int[Array, " 3"]:
+        look, read = jax.random.split(key)
+        seen: Bool[Array, ""] = jnp.array(True)
+        if sensor.presence is not None:
+            seen = jax.random.uniform(look) < sensor.presence[state]
+        if sensor.reading is not None:
+            state, action = sensor.reading.report(read, state, action)
+        values = jnp.stack([jnp.array(SEEN), state, action])
+        return jnp.where(seen, values, jnp.array([HIDDEN, UNKNOWN, UNKNOWN])).astype(jnp.int32)
+
+    return jax.vmap(one)(jax.random.split(key, states.shape[0]), states, actions)
+
+
+def require_possible(
+    sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration, record: str = "trajectory"
+) -> None:
+    """Raise :class:`DemonstrationError` at the first step that no behaviour of the MDP could have produced.
+
+    Follows the set of states that could still be true; ``record`` names what a row is in the message.
+    """
+    successors, possible_move = np.asarray(mdp.successors), np.asarray(mdp.probabilities) > 0
+    available = np.asarray(mdp.available)
+    name = _PairNames(mdp.labels)
+    names = {SEEN: "seen", HIDDEN: "hidden", LOST: "lost"}
+    start = np.asarray(mdp.initial) > 0
+    evidence = jax.jit(step_log_evidence, static_argnums=(1, 2)) if sensor.reading is not None else None
+    presence = np.ones(mdp.n_states) if sensor.presence is None else np.asarray(sensor.presence)
+    for i in range(demonstration.n_trajectories):
+        states = start
+        for t, (kind, s, a, score) in enumerate(zip(*(np.asarray(x)[i] for x in demonstration), strict=True)):
+            if kind == PAD:
+                break
+            if kind == SEEN and evidence is None:
+                pairs = np.zeros_like(available)
+                rows = slice(None) if s == UNKNOWN else slice(s, s + 1)
+                columns = slice(None) if a == UNKNOWN else slice(a, a + 1)
+                pairs[rows, columns] = True
+                pairs &= (presence > 0)[:, None]
+            elif kind == SEEN and evidence is not None:
+                pairs = np.asarray(evidence(sensor, mdp.n_states, mdp.n_actions, kind, s, a, score)) > -np.inf
+            elif kind == HIDDEN:
+                pairs = np.broadcast_to((presence < 1)[:, None], available.shape)
+            else:
+                pairs = np.ones_like(available)
+            allowed = pairs & available
+            if not (allowed & states[:, None]).any():
+                seen = ""
+                if kind == SEEN:
+                    seen = " " + ", ".join(
+                        ([] if s == UNKNOWN else [f"state {name.state(s)}"])
+                        + ([] if a == UNKNOWN else [f"action {name.action(a)}"])
+                    )
+                if not pairs.any():
+                    reason = "the view excludes it" if kind == SEEN else "every state is in view"
+                elif not allowed.any():
+                    reason = "the action is not available there"
+                elif t == 0:
+                    reason = "the initial distribution excludes it"
+                else:
+                    reason = "no transition leads there from the step before"
+                raise DemonstrationError(
+                    f"{record} {i}, step {t}: impossible observation: {names[int(kind)]}{seen}; {reason}"
+                )
+            rows, columns = np.nonzero(allowed & states[:, None])
+            states = np.zeros(mdp.n_states, bool)
+            states[successors[rows, columns][possible_move[rows, columns]]] = True

@@ -1,0 +1,369 @@
+"""The decision process an expert acts in, without its reward."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy import sparse
+
+# Gathering from predecessors beats scattering to successors on a CPU while no state has far more
+# predecessors than the average; past this ratio (an absorbing sink, say) the padding costs more.
+_MAX_INFLOW_RATIO = 6
+
+
+@dataclass(frozen=True)
+class Labels:
+    """Names of states, actions and features; absent names default to ``s3``, ``a1``, ``f0``."""
+
+    states: tuple[str, ...] | None = None
+    actions: tuple[str, ...] | None = None
+    features: tuple[str, ...] | None = None
+    _hash: int = field(init=False, repr=False, compare=False, default=0)
+
+    def __post_init__(self) -> None:
+        # Hashed once: a compiled function looks its static arguments up at every call.
+        object.__setattr__(self, "_hash", hash((self.states, self.actions, self.features)))
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: object) -> bool:
+        if self is other:
+            return True
+        if not isinstance(other, Labels) or self._hash != other._hash:
+            return False
+        return (self.states, self.actions, self.features) == (other.states, other.actions, other.features)
+
+
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=[
+        "successors", "probabilities", "features", "initial", "discount", "available",
+        "inflow_pairs", "inflow_probabilities",
+    ],
+    meta_fields=["labels"],
+)  # fmt: skip
+@dataclass(frozen=True)
+class TabularMDP:
+    """A finite MDP without a reward, ``<S, A, P, phi, gamma, p0>`` (Definition 1), as successor lists.
+
+    Built by :meth:`from_successors`, :meth:`from_dense` or :meth:`from_sparse`, which check it once;
+    immutable, and a JAX pytree, so it passes through ``jit``, ``vmap`` and ``grad``.
+
+    Attributes
+    ----------
+    successors : int ``[S, A, B]``
+        The states that may follow each pair; padded entries have probability zero.
+    probabilities : float ``[S, A, B]``
+        Their probabilities, summing to one over ``B`` for every available pair.
+    features : float ``[S, A, K]``
+        Reward features ``phi(s, a)``; the reward is ``theta . phi``.
+    initial : float ``[S]``
+        Distribution of the first state, ``p0``.
+    discount : float scalar
+        ``gamma`` in (0, 1]; 1 only for finite horizons.
+    available : bool ``[S, A]``
+        Which actions exist in which state.
+    inflow_pairs, inflow_probabilities : ``[S, M]`` or None
+        The same transitions seen from the state they lead to (flat pair index and probability), kept
+        where no state has far more predecessors than the average.
+    labels : Labels
+        Names.
+    """
+
+    successors: Int[Array, "S A B"]
+    probabilities: Float[Array, "S A B"]
+    features: Float[Array, "S A K"]
+    initial: Float[Array, " S"]
+    discount: Float[Array, ""]
+    available: Bool[Array, "S A"]
+    inflow_pairs: Int[Array, "S M"] | None
+    inflow_probabilities: Float[Array, "S M"] | None
+    labels: Labels = Labels()
+
+    # -- construction ---------------------------------------------------------------------------------
+
+    @staticmethod
+    def from_successors(
+        successors: np.ndarray,
+        probabilities: np.ndarray,
+        features: np.ndarray,
+        *,
+        initial: np.ndarray | None = None,
+        discount: float = 0.99,
+        available: np.ndarray | None = None,
+        states: Sequence[str] | None = None,
+        actions: Sequence[str] | None = None,
+        feature_names: Sequence[str] | None = None,
+    ) -> TabularMDP:
+        """Build an MDP from successor lists ``[S, A, B]``.
+
+        ``initial`` defaults to uniform, ``available`` to every pair. Raises ``ValueError`` that names the
+        state, action or feature at fault: probabilities that are negative, NaN or do not sum to one,
+        successors that are no states, features of the wrong shape or not finite, a discount outside
+        (0, 1], a state with no available action, names of the wrong number or repeated.
+        """
+        successors = np.asarray(successors)
+        probabilities = np.asarray(probabilities, dtype=float)
+        features = np.asarray(features, dtype=float)
+        if successors.ndim != 3 or successors.shape != probabilities.shape:
+            raise ValueError(
+                "successors and probabilities must have one shape [S, A, B], got "
+                f"{successors.shape} and {probabilities.shape}"
+            )
+        n_states, n_actions, _ = successors.shape
+        if min(successors.shape) == 0:
+            raise ValueError(f"an MDP needs at least one state, action and successor, got {successors.shape}")
+        labels = _checked_labels(states, actions, feature_names, n_states, n_actions, features)
+        name = _PairNames(labels)
+        if features.ndim != 3 or features.shape[:2] != (n_states, n_actions) or features.shape[2] == 0:
+            raise ValueError(
+                f"features must have shape [S, A, K] = [{n_states}, {n_actions}, K >= 1], got {features.shape}"
+            )
+        available = np.ones((n_states, n_actions), bool) if available is None else np.asarray(available)
+        if available.shape != (n_states, n_actions) or available.dtype != bool:
+            raise ValueError(
+                f"available must be a boolean array [{n_states}, {n_actions}], got {available.dtype} {available.shape}"
+            )
+        if not available.any(1).all():
+            s = int(np.flatnonzero(~available.any(1))[0])
+            raise ValueError(
+                f"state {name.state(s)} has no available action; an absorbing state needs an action that stays there"
+            )
+        if not np.isfinite(features[available]).all():
+            s, a, k = np.argwhere(~np.isfinite(features) & available[..., None])[0]
+            raise ValueError(f"feature {name.feature(k)} of {name.pair(s, a)} is {features[s, a, k]}, not a number")
+        _check_transitions(successors, probabilities, available, n_states, name)
+        if not 0 < discount <= 1:
+            raise ValueError(f"discount must lie in (0, 1], got {discount}")
+        initial = np.full(n_states, 1 / n_states) if initial is None else np.asarray(initial, dtype=float)
+        if initial.shape != (n_states,):
+            raise ValueError(f"initial must have shape [{n_states}], got {initial.shape}")
+        if not np.isfinite(initial).all() or (initial < 0).any() or abs(initial.sum() - 1) > 1e-8:
+            raise ValueError(
+                f"initial must be a distribution over states: its least value is {initial.min()}, its sum {initial.sum()}"
+            )
+        # Unavailable pairs lead nowhere: they keep their place with zero probability and zero features.
+        probabilities = np.where(available[..., None], probabilities, 0.0)
+        features = np.where(available[..., None], features, 0.0)
+        successors = np.where(probabilities > 0, successors, np.arange(n_states)[:, None, None]).astype(np.int32)
+        inflow = _inflow(successors, probabilities)
+        return TabularMDP(
+            successors=jnp.asarray(successors),
+            probabilities=jnp.asarray(probabilities),
+            features=jnp.asarray(features),
+            initial=jnp.asarray(initial / initial.sum()),
+            discount=jnp.asarray(float(discount)),
+            available=jnp.asarray(available),
+            inflow_pairs=None if inflow is None else jnp.asarray(inflow[0]),
+            inflow_probabilities=None if inflow is None else jnp.asarray(inflow[1]),
+            labels=labels,
+        )
+
+    @staticmethod
+    def from_dense(transitions: np.ndarray, features: np.ndarray, **options: object) -> TabularMDP:
+        """Build an MDP from dense transitions ``[S, A, S]``; options as for :meth:`from_successors`."""
+        transitions = np.asarray(transitions, dtype=float)
+        if transitions.ndim != 3 or transitions.shape[0] != transitions.shape[2]:
+            raise ValueError(f"dense transitions must have shape [S, A, S], got {transitions.shape}")
+        n_states, n_actions, _ = transitions.shape
+        rows = sparse.csr_array(transitions.reshape(n_states * n_actions, n_states))
+        return TabularMDP.from_sparse(rows, features, **options)
+
+    @staticmethod
+    def from_sparse(
+        transitions: sparse.sparray | sparse.spmatrix | Sequence[sparse.sparray | sparse.spmatrix],
+        features: np.ndarray,
+        **options: object,
+    ) -> TabularMDP:
+        """Build an MDP from SciPy-sparse transitions.
+
+        Either one matrix ``[S * A, S]`` whose row ``s * A + a`` is the distribution after pair ``(s, a)``,
+        or a sequence of ``A`` matrices ``[S, S]``. Options as for :meth:`from_successors`.
+        """
+        if not sparse.issparse(transitions):
+            blocks = [sparse.csr_array(block) for block in transitions]
+            n_states, n_actions = blocks[0].shape[0], len(blocks)
+            if any(block.shape != (n_states, n_states) for block in blocks):
+                raise ValueError(f"each action's matrix must be [S, S], got {[b.shape for b in blocks]}")
+            stacked = sparse.vstack(blocks, format="csr")
+            rows = stacked[np.arange(n_states * n_actions).reshape(n_actions, n_states).T.ravel()]
+        else:
+            rows = sparse.csr_array(transitions)
+            n_states = rows.shape[1]
+            if rows.shape[0] % n_states:
+                raise ValueError(f"transitions must have shape [S * A, S], got {rows.shape}")
+            n_actions = rows.shape[0] // n_states
+        rows = sparse.csr_array(rows)
+        rows.sum_duplicates()
+        counts = np.diff(rows.indptr)
+        width = max(int(counts.max(initial=0)), 1)
+        slot = np.arange(rows.nnz) - np.repeat(rows.indptr[:-1], counts)
+        pair = np.repeat(np.arange(len(counts)), counts)
+        successors = np.repeat(np.repeat(np.arange(n_states), n_actions)[:, None], width, axis=1)
+        probabilities = np.zeros((len(counts), width))
+        successors[pair, slot] = rows.indices
+        probabilities[pair, slot] = rows.data
+        shape = (n_states, n_actions, width)
+        return TabularMDP.from_successors(
+            successors.reshape(shape), probabilities.reshape(shape), features, **options  # type: ignore[arg-type]
+        )
+
+    # -- shape and names ------------------------------------------------------------------------------
+
+    @property
+    def n_states(self) -> int:
+        """Number of states, ``S``."""
+        return self.successors.shape[-3]
+
+    @property
+    def n_actions(self) -> int:
+        """Number of actions, ``A``."""
+        return self.successors.shape[-2]
+
+    @property
+    def n_features(self) -> int:
+        """Number of reward features, ``K``."""
+        return self.features.shape[-1]
+
+    @property
+    def state_names(self) -> tuple[str, ...]:
+        """Names of the states, given or ``s0, s1, ...``."""
+        return self.labels.states or tuple(f"s{i}" for i in range(self.n_states))
+
+    @property
+    def action_names(self) -> tuple[str, ...]:
+        """Names of the actions, given or ``a0, a1, ...``."""
+        return self.labels.actions or tuple(f"a{i}" for i in range(self.n_actions))
+
+    @property
+    def feature_names(self) -> tuple[str, ...]:
+        """Names of the features, given or ``f0, f1, ...``."""
+        return self.labels.features or tuple(f"f{i}" for i in range(self.n_features))
+
+    def fingerprint(self) -> str:
+        """Hexadecimal digest of everything that defines this MDP; equal exactly for equal MDPs."""
+        digest = hashlib.sha256()
+        for leaf in (
+            self.successors, self.probabilities, self.features, self.initial, self.discount, self.available,
+        ):  # fmt: skip
+            array = np.ascontiguousarray(leaf)
+            digest.update(f"{array.dtype}{array.shape}".encode())
+            digest.update(array.tobytes())
+        digest.update(repr((self.labels.states, self.labels.actions, self.labels.features)).encode())
+        return digest.hexdigest()
+
+    def with_initial(self, initial: Float[Array, " S"]) -> TabularMDP:
+        """The same process started elsewhere (unchecked, so that it works under a trace)."""
+        return replace(self, initial=initial)
+
+    # -- the two directions of the dynamics -----------------------------------------------------------
+
+    def expect_next(self, values: Float[Array, " S"]) -> Float[Array, "S A"]:
+        """Expected value after each pair, ``sum_s' P(s' | s, a) v(s')``."""
+        return jnp.einsum("sab,sab->sa", self.probabilities, values[self.successors])
+
+    def push_forward(self, pairs: Float[Array, "S A"]) -> Float[Array, " S"]:
+        """Mass on the next state from mass on pairs, ``sum_{s, a} x(s, a) P(s' | s, a)``."""
+        if self.inflow_pairs is not None and self.inflow_probabilities is not None:
+            return jnp.einsum("sm,sm->s", self.inflow_probabilities, pairs.reshape(-1)[self.inflow_pairs])
+        flow = pairs[..., None] * self.probabilities
+        return jax.ops.segment_sum(flow.reshape(-1), self.successors.reshape(-1), self.n_states)
+
+    def transition_probability(self, state: Int[Array, ""]) -> Float[Array, "S A"]:
+        """Probability of reaching ``state`` from each pair, ``P(state | s, a)``."""
+        return jnp.sum(jnp.where(self.successors == state, self.probabilities, 0.0), axis=-1)
+
+    def state_transitions(self, policy: Float[Array, "S A"]) -> Float[Array, "S S"]:
+        """The Markov chain of a policy as a dense matrix ``[S, S]`` (small state spaces only)."""
+        flow = policy[..., None] * self.probabilities
+        rows = jnp.broadcast_to(jnp.arange(self.n_states)[:, None, None], self.successors.shape)
+        return jnp.zeros((self.n_states, self.n_states)).at[rows, self.successors].add(flow)
+
+
+@dataclass(frozen=True)
+class _PairNames:
+    """Names for error messages, looked up one at a time (a million states need no million names)."""
+
+    labels: Labels
+
+    def state(self, s: int) -> str:
+        return f"{self.labels.states[s]!r} ({s})" if self.labels.states else f"{int(s)}"
+
+    def action(self, a: int) -> str:
+        return f"{self.labels.actions[a]!r} ({a})" if self.labels.actions else f"{int(a)}"
+
+    def feature(self, k: int) -> str:
+        return f"{self.labels.features[k]!r} ({k})" if self.labels.features else f"{int(k)}"
+
+    def pair(self, s: int, a: int) -> str:
+        return f"state {self.state(s)}, action {self.action(a)}"
+
+
+def _checked_labels(
+    states: Sequence[str] | None,
+    actions: Sequence[str] | None,
+    features: Sequence[str] | None,
+    n_states: int,
+    n_actions: int,
+    feature_array: np.ndarray,
+) -> Labels:
+    sizes = {"state": n_states, "action": n_actions, "feature": feature_array.shape[-1] if feature_array.ndim else 0}
+    given = {"state": states, "action": actions, "feature": features}
+    for kind, names in given.items():
+        if names is None:
+            continue
+        if len(names) != sizes[kind]:
+            raise ValueError(f"{len(names)} {kind} names were given for {sizes[kind]} {kind}s")
+        if len(set(names)) != len(names):
+            repeated = sorted({n for n in names if list(names).count(n) > 1})[:3]
+            raise ValueError(f"{kind} names must differ; repeated: {', '.join(repeated)}")
+    return Labels(*(None if names is None else tuple(str(n) for n in names) for names in given.values()))
+
+
+def _check_transitions(
+    successors: np.ndarray, probabilities: np.ndarray, available: np.ndarray, n_states: int, name: _PairNames
+) -> None:
+    mask = available[..., None]
+    if not np.isfinite(probabilities[available]).all():
+        s, a, _ = np.argwhere(~np.isfinite(probabilities) & mask)[0]
+        raise ValueError(f"a transition probability of {name.pair(s, a)} is not a number")
+    if (np.where(mask, probabilities, 0) < 0).any():
+        s, a, b = np.argwhere((probabilities < 0) & mask)[0]
+        raise ValueError(f"a transition probability of {name.pair(s, a)} is negative: {probabilities[s, a, b]}")
+    total = probabilities.sum(-1)
+    wrong = available & (np.abs(total - 1) > 1e-8)
+    if wrong.any():
+        s, a = np.argwhere(wrong)[0]
+        raise ValueError(
+            f"transition probabilities must sum to 1; those of {name.pair(s, a)} sum to {total[s, a]}"
+        )
+    outside = ((successors < 0) | (successors >= n_states)) & (probabilities > 0) & mask
+    if outside.any():
+        s, a, b = np.argwhere(outside)[0]
+        raise ValueError(f"{name.pair(s, a)} leads to state {successors[s, a, b]}, but states are 0 to {n_states - 1}")
+
+
+def _inflow(successors: np.ndarray, probabilities: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    n_states, n_actions, width = successors.shape
+    source = np.flatnonzero(probabilities.ravel() > 0)
+    target = successors.ravel()[source]
+    order = np.argsort(target, kind="stable")
+    source, target = source[order], target[order]
+    counts = np.bincount(target, minlength=n_states)
+    most = max(int(counts.max(initial=0)), 1)
+    if most > _MAX_INFLOW_RATIO * max(len(source) / n_states, 1):
+        return None
+    slot = np.arange(len(source)) - np.repeat(np.cumsum(counts) - counts, counts)
+    pairs = np.zeros((n_states, most), np.int32)
+    weights = np.zeros((n_states, most))
+    pairs[target, slot] = source // width
+    weights[target, slot] = probabilities.ravel()[source]
+    return pairs, weights

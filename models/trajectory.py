@@ -1,0 +1,114 @@
+"""The law of an imperfectly observed trajectory, as a NumPyro distribution."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpyro.distributions as dist
+from jaxtyping import Array, Bool, Float, Int
+from numpyro.distributions import constraints
+
+from .chain import filter_forward
+from .demonstration import HIDDEN, LOST, PAD, SEEN, Demonstration
+from .evidence import Imperfection, observe, step_log_evidence
+from .mdp import TabularMDP
+from .planning import reward_of, simulate, soft_plan
+
+
+class _Codes(constraints.Constraint):  # type: ignore[misc]
+    """Codes (kind, state, action) of known kinds, states and actions."""
+
+    is_discrete = True
+    event_dim = 2
+
+    def __init__(self, n_states: int, n_actions: int) -> None:
+        self.n_states, self.n_actions = n_states, n_actions
+        super().__init__()
+
+    def __call__(self, x: Int[Array, "... L 3"]) -> Bool[Array, "..."]:
+        kind, state, action = x[..., 0], x[..., 1], x[..., 2]
+        inside = (kind >= PAD) & (kind <= LOST) & (state < self.n_states) & (action < self.n_actions)
+        seen = (kind != SEEN) | (state >= 0) | (action >= 0)
+        return jnp.all(inside & seen, axis=-1)
+
+    def feasible_like(self, prototype: Array) -> Array:
+        return jnp.broadcast_to(jnp.array([HIDDEN, -1, -1], jnp.int32), prototype.shape)
+
+    def tree_flatten(self) -> tuple:
+        return (), ((), {"n_states": self.n_states, "n_actions": self.n_actions})
+
+
+class TrajectoryLaw(dist.Distribution):  # type: ignore[misc]
+    """What a sensor perceives of ``length`` steps of an expert who follows the soft policy of ``theta . phi``.
+
+    A value is an integer array ``[..., L, 3]`` of (kind, state, action), as in
+    :attr:`Demonstration.codes`; trajectories shorter than ``length`` are padded. ``log_prob`` is exact:
+    hidden steps, lost frames and noise are summed out by one forward pass, and it is differentiable in the
+    weights. ``sample`` simulates the expert and passes the trajectory through the sensor (it never loses
+    frames: those say nothing about the expert).
+
+    Parameters
+    ----------
+    mdp : TabularMDP
+    weights : float ``[K]`` (``theta``)
+    sensor : Imperfection
+        What is hidden and what is noisy; ``Sensor()`` sees everything.
+    length : int
+        Steps of an event, ``L``.
+    """
+
+    arg_constraints = {"weights": constraints.real_vector}  # noqa: RUF012
+    pytree_data_fields = ("mdp", "weights", "sensor", "log_policy")
+    pytree_aux_fields = ("length",)
+
+    def __init__(
+        self,
+        mdp: TabularMDP,
+        weights: Float[Array, " K"],
+        sensor: Imperfection,
+        length: int,
+        *,
+        validate_args: bool | None = None,
+    ) -> None:
+        self.mdp, self.weights, self.sensor, self.length = mdp, weights, sensor, length
+        self.log_policy = soft_plan(mdp, reward_of(mdp, weights)).log_policy
+        super().__init__((), (length, 3), validate_args=validate_args)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """Integer codes of known kinds, states and actions."""
+        return _Codes(self.mdp.n_states, self.mdp.n_actions)
+
+    def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Int[Array, "... L 3"]:
+        """Simulate what would be perceived."""
+
+        def one(key: Array) -> Int[Array, "L 3"]:
+            act, look = jax.random.split(key)
+            states, actions = simulate(act, self.mdp, self.log_policy, self.length)
+            return observe(look, self.sensor, states, actions)
+
+        size = 1
+        for n in sample_shape:
+            size *= n
+        codes = jax.vmap(one)(jax.random.split(key, size))
+        return codes.reshape((*sample_shape, self.length, 3))
+
+    def log_prob(self, value: Int[Array, "... L 3"]) -> Float[Array, "..."]:
+        """Exact log-probability of what was perceived, hidden steps summed out."""
+
+        def one(codes: Int[Array, "L 3"]) -> Float[Array, ""]:
+            kind, state, action = codes[:, 0], codes[:, 1], codes[:, 2]
+            evidence = jax.vmap(
+                lambda k, s, a: step_log_evidence(
+                    self.sensor, self.mdp.n_states, self.mdp.n_actions, k, s, a, jnp.array(jnp.nan)
+                )
+            )(kind, state, action)
+            return filter_forward(self.mdp, evidence + self.log_policy, kind != PAD).log_likelihood
+
+        flat = jnp.asarray(value).reshape((-1, self.length, 3))
+        return jax.vmap(one)(flat).reshape(value.shape[:-2])
+
+
+def sample_demonstration(key: Array, law: TrajectoryLaw, n_trajectories: int) -> Demonstration:
+    """Simulate a demonstration of independent trajectories."""
+    return Demonstration.from_codes(law.sample(key, (n_trajectories,)))
