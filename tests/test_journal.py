@@ -1,0 +1,736 @@
+import os
+import re
+import shutil
+import sqlite3
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import arviz
+import hypothesis.extra.numpy as hnp
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from i2rl.inference.journal import (
+    APPLICATION_ID,
+    SCHEMA_VERSION,
+    Journal,
+    JournalBusy,
+    JournalError,
+    Position,
+)
+from i2rl.inference.serialization import decode, encode, restore
+from i2rl.models import TabularMDP
+
+# -- a learner small enough to compute by hand ----------------------------------------------------------
+
+
+class Statistic(NamedTuple):
+    counts: Any
+    total: Any
+
+
+class State(NamedTuple):
+    weights: Any
+    statistic: Statistic
+    warm: Any
+    session: Any
+    key: Any
+
+
+class Report(NamedTuple):
+    log_likelihood: Any
+    gap: Any
+    status: str
+    found: Any
+
+
+class Toy(NamedTuple):
+    """Adds noise to a demonstration's counts: what it learns depends on every bit of its state."""
+
+    mdp: TabularMDP
+    name: str = "toy"
+    step: float = 0.5
+
+    @property
+    def configuration(self) -> dict[str, Any]:
+        return {"step": self.step}
+
+    @property
+    def signature(self) -> str:
+        return f"{self.mdp.fingerprint()}-{self.name}-{self.step}"
+
+    def init(self, key: Any) -> State:
+        k = self.mdp.n_features
+        return State(jnp.zeros(k), Statistic(jnp.zeros(k), 0.0), jnp.zeros((0, k)), 0, key)
+
+    def update(self, state: State, counts: Any) -> tuple[State, Report]:
+        key, noise = jax.random.split(state.key)
+        weights = state.weights + self.step * (counts + jax.random.normal(noise, state.weights.shape))
+        statistic = Statistic(state.statistic.counts + counts, state.statistic.total + 1 / 3)
+        session = state.session + 1
+        found = None if session == 1 else np.arange(session)
+        report = Report(-weights.sum(), weights**2, "converged", found)
+        return State(weights, statistic, jnp.outer(weights, weights), session, key), report
+
+
+def process(seed: int = 0, feature_names: list[str] | None = None) -> TabularMDP:
+    rng = np.random.default_rng(seed)
+    transitions = rng.dirichlet(np.ones(3), size=(3, 2))
+    return TabularMDP.from_dense(transitions, rng.normal(size=(3, 2, 2)), feature_names=feature_names)
+
+
+@pytest.fixture
+def learner() -> Toy:
+    return Toy(process(feature_names=["near", "far"]))
+
+
+def learned(learner: Toy, sessions: int, state: State | None = None) -> list[tuple[State, Report]]:
+    state = learner.init(jax.random.key(7)) if state is None else state
+    history = []
+    for _ in range(sessions):
+        state, report = learner.update(state, jnp.arange(2.0) + state.session)
+        history.append((state, report))
+    return history
+
+
+def bits(tree: Any) -> list[tuple]:
+    """Everything that tells two trees apart: containers, types, shapes and bits."""
+
+    def of(leaf: Any) -> tuple:
+        if isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
+            leaf, kind = jax.random.key_data(leaf), str(leaf.dtype)
+        else:
+            kind = type(leaf).__name__
+        array = np.asarray(leaf)
+        return kind, array.dtype.str, array.shape, repr(leaf) if leaf is None else array.tobytes()
+
+    leaves, structure = jax.tree.flatten(tree, is_leaf=lambda leaf: leaf is None)
+    return [str(structure), *map(of, leaves)]
+
+
+# -- the bytes ------------------------------------------------------------------------------------------
+
+
+def test_a_nested_state_comes_back_to_the_bit() -> None:
+    payload = np.array([0x7FF8_0000_DEAD_BEEF, 0xFFF0_0000_0000_0001, 0x8000_0000_0000_0000, 1], np.uint64)
+    tree = State(
+        weights=payload.view(float),
+        statistic=Statistic(
+            jnp.asarray(payload.view(float)), {"mask": np.array([[True, False]]), "none": None}
+        ),
+        warm=[
+            np.int8(-7),
+            np.zeros((0, 3), np.int16),
+            np.arange(6).reshape(2, 3).T,
+            (1, 2.5, True, 1j),
+            "über",
+            jnp.bfloat16(1.5),
+        ],
+        session=2**63,
+        key=(jax.random.key(3), jax.random.split(jax.random.key(3, impl="rbg"), 4), np.float32(0.1)),
+    )
+    assert bits(restore(decode(encode(tree)), tree)) == bits(tree)
+
+
+dtypes = st.one_of(
+    hnp.boolean_dtypes(),
+    hnp.integer_dtypes(),
+    hnp.unsigned_integer_dtypes(),
+    hnp.floating_dtypes(sizes=(16, 32, 64)),
+    hnp.complex_number_dtypes(sizes=(64, 128)),
+    hnp.unicode_string_dtypes(max_len=3),
+    hnp.datetime64_dtypes(),
+)
+numbers = hnp.arrays(dtypes, hnp.array_shapes(min_dims=0, max_dims=3, min_side=0, max_side=3))
+leaves = st.one_of(
+    numbers,
+    numbers.map(lambda array: array.T),
+    hnp.arrays(np.float64, 3).map(jnp.asarray),
+    st.none(), st.booleans(), st.integers(-(2**63), 2**64 - 1), st.floats(), st.text(max_size=4),
+    st.integers(0, 9).map(jax.random.key),
+)  # fmt: skip
+trees = st.recursive(
+    leaves,
+    lambda inner: st.one_of(
+        st.builds(Statistic, inner, inner),
+        st.lists(inner, max_size=3),
+        st.dictionaries(st.sampled_from("abcd"), inner, max_size=3),
+    ),
+    max_leaves=6,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(trees)
+def test_any_tree_comes_back_to_the_bit(tree: Any) -> None:
+    blob = encode(tree)
+    assert bits(restore(decode(blob), tree)) == bits(tree)
+    assert encode(tree) == blob
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_no_flipped_bit_or_lost_end_goes_unnoticed(data: st.DataObject) -> None:
+    blob = bytearray(encode({"weights": np.arange(3.0), "session": 4}))
+    where = data.draw(st.integers(0, len(blob) - 1))
+    if data.draw(st.booleans()):
+        blob[where] ^= 1 << data.draw(st.integers(0, 7))
+    else:
+        del blob[where:]
+    with pytest.raises(ValueError, match="damaged"):
+        decode(bytes(blob))
+
+
+@pytest.mark.parametrize(
+    "leaf", [object(), 2**70, b"bytes", np.array([None]), np.zeros(1, [("x", int)]), len]
+)
+def test_what_cannot_be_stored_is_named(leaf: Any) -> None:
+    with pytest.raises(TypeError, match=r"^statistic\.total is "):
+        encode(State(0, Statistic(1, leaf), None, 0, None))
+
+
+@pytest.mark.parametrize(
+    ("stored", "template"),
+    [
+        (np.zeros((2, 3)), np.zeros((0, 3))),
+        (np.zeros((2, 3)), None),
+        (jax.random.key(0), None),
+        (None, None),
+        (None, np.zeros((0, 3))),
+        (np.int64(3), 3),
+        (jnp.int32(3), 3),
+        (jax.random.key(0, impl="rbg"), jax.random.key(0)),
+    ],
+)
+def test_what_begins_with_the_first_session_may_differ_from_the_template(stored: Any, template: Any) -> None:
+    assert bits(restore(decode(encode({"warm": stored})), {"warm": template})) == bits({"warm": stored})
+
+
+@pytest.mark.parametrize(
+    ("stored", "template"),
+    [
+        (np.zeros(3), np.zeros(2)),
+        (np.zeros(3, np.float32), np.zeros(3)),
+        (np.zeros((2, 3), int), np.zeros((0, 3))),
+        (None, np.zeros(3)),
+        (jax.random.split(jax.random.key(0)), jax.random.key(0)),
+        (np.zeros(2, np.uint32), jax.random.key(0)),
+        (jax.random.key(0), np.zeros(2, np.uint32)),
+        ("text", 1.0),
+        (1.0, "text"),
+        (1.0, 1),
+        (True, 1),
+    ],
+)
+def test_a_leaf_that_does_not_fit_is_named(stored: Any, template: Any) -> None:
+    with pytest.raises(ValueError, match=r"warm is stored as .* is expected"):
+        restore(decode(encode({"warm": stored})), {"warm": template})
+
+
+def test_parts_that_do_not_fit_are_named() -> None:
+    with pytest.raises(ValueError, match=r"\['old'\] stored and not expected, \['new'\] expected and not"):
+        restore(decode(encode({"old": 1, "both": 2})), {"new": 1, "both": 2})
+
+
+# -- sessions -------------------------------------------------------------------------------------------
+
+
+def test_a_learner_that_stops_and_resumes_learns_the_same_to_the_bit(learner: Toy, tmp_path: Path) -> None:
+    whole = learned(learner, 6)
+    state = None
+    for _ in range(3):
+        with Journal.open(tmp_path / "j", learner) as journal:
+            assert (journal.state is None) == (state is None)
+            for state, report in learned(learner, 2, journal.state):
+                journal.commit(state, report)
+    with Journal.open(tmp_path / "j", learner) as journal:
+        assert bits(journal.state) == bits(whole[-1][0])
+        assert journal.session == 6
+        for (state, report), record in zip(whole, journal.reports(), strict=True):
+            assert record.session == state.session
+            assert bits(record.weights) == bits(np.asarray(state.weights))
+            assert list(record.report) == list(Report._fields)
+            for name, value in report._asdict().items():
+                np.testing.assert_array_equal(record.report[name], value)
+
+
+def test_the_first_state_comes_from_the_learner(learner: Toy, tmp_path: Path) -> None:
+    with Journal.open(tmp_path / "j", learner) as journal:
+        assert journal.state is None
+        assert (journal.session, journal.position) == (0, Position())
+        assert list(journal.reports()) == []
+        assert journal.stored_state() == {}
+
+
+def test_a_session_is_not_committed_twice(learner: Toy, tmp_path: Path) -> None:
+    (first, report), (second, _) = learned(learner, 2)
+    with Journal.open(tmp_path / "j", learner) as journal:
+        journal.commit(second, report)
+        for state in (first, second):
+            with pytest.raises(ValueError, match=f"session {state.session} is already committed"):
+                journal.commit(state, report)
+        assert [record.session for record in journal.reports()] == [2]
+
+
+def test_the_position_is_committed_with_the_session(learner: Toy, tmp_path: Path) -> None:
+    lines = ["one\n", "\n", "two\n", "thrée"]
+    position = Position()
+    with Journal.open(tmp_path / "j", learner) as journal:
+        for line, (state, report) in zip(lines[:3], learned(learner, 3), strict=True):
+            position = position.after(line)
+            journal.commit(state, report, position)
+        (last, report) = learned(learner, 1, journal.state)[0]
+        journal.commit(last, report)
+        assert [record.position.records for record in journal.reports()] == [1, 2, 3, 3]
+    with Journal.open(tmp_path / "j", learner) as journal:
+        assert journal.position == position
+        assert list(journal.position.unread(lines)) == ["thrée"]
+        assert list(journal.position.unread(line.replace("\n", "\r\n") for line in lines)) == ["thrée"]
+
+
+def test_another_input_is_not_continued() -> None:
+    position = Position().after("one\n").after("two\n")
+    for other in (["one\n", "too\n", "three\n"], ["onet\n", "wo\n"], ["two\n", "one\n"]):
+        with pytest.raises(JournalError, match="the first 2 lines of the input are not those"):
+            list(position.unread(other))
+    with pytest.raises(JournalError, match="the input ends after 1 lines, but 2 were"):
+        list(position.unread(["one\n"]))
+
+
+def test_the_file_grows_by_reports_and_not_by_states(learner: Toy, tmp_path: Path) -> None:
+    (state, report) = learned(learner, 1)[0]
+    heavy = state._replace(warm=jnp.ones((1000, 100)))
+    sizes = []
+    with Journal.open(tmp_path / "j", learner) as journal:
+        for session in range(1, 41):
+            journal.commit(heavy._replace(session=session), report)
+            sizes.append(sum(file.stat().st_size for file in tmp_path.iterdir()))
+    assert (tmp_path / "j").stat().st_size < 2.2 * heavy.warm.nbytes
+    assert max(sizes) < 10 * heavy.warm.nbytes  # the log is folded in as it grows
+
+
+def test_a_closed_journal_is_one_file_that_can_be_moved(learner: Toy, tmp_path: Path) -> None:
+    (state, report) = learned(learner, 1)[0]
+    with Journal.open(tmp_path / "j", learner) as journal:
+        journal.commit(state, report)
+    journal.close()  # again
+    assert sorted(file.name for file in tmp_path.iterdir()) == ["j", "j-lock"]
+    assert (tmp_path / "j-lock").stat().st_size == 0
+    # Not in log mode any more (SQLite's format versions), so that it can be read in a read-only folder.
+    assert (tmp_path / "j").read_bytes()[18:20] == b"\x01\x01"
+    (tmp_path / "elsewhere").mkdir()
+    shutil.copy(tmp_path / "j", tmp_path / "elsewhere" / "a name with spaces?&#.i2rl")
+    with Journal.open(tmp_path / "elsewhere" / "a name with spaces?&#.i2rl", learner) as journal:
+        assert bits(journal.state) == bits(state)
+
+
+# -- who may write --------------------------------------------------------------------------------------
+
+
+def test_a_second_writer_is_refused_in_the_same_process(learner: Toy, tmp_path: Path) -> None:
+    (tmp_path / "link").symlink_to(tmp_path / "j")
+    with Journal.open(tmp_path / "j", learner) as journal:
+        for name in ("j", "link"):
+            with pytest.raises(JournalBusy, match="is open for writing in this process"):
+                Journal.open(tmp_path / name, learner)
+        (state, report) = learned(learner, 1)[0]
+        journal.commit(state, report)  # the refusals released nothing
+        with pytest.raises(JournalBusy):
+            Journal.open(tmp_path / "j", learner)
+    Journal.open(tmp_path / "j", learner).close()
+
+
+# A writer that needs no JAX computation: it commits a counter and all that follows from it.
+COUNTER = textwrap.dedent(
+    """
+    import os, random, signal, sys, time
+    from typing import Any, NamedTuple
+    import numpy as np
+    from i2rl.inference.journal import Journal, JournalError, Position
+
+    class State(NamedTuple):
+        weights: Any
+        statistic: Any
+        session: int
+
+    class Report(NamedTuple):
+        square: int
+
+    class MDP:
+        n_states, n_actions, feature_names = 2, 2, ("x", "y")
+        def fingerprint(self):
+            return "f" * 64
+
+    class Counter:
+        name, signature, mdp, configuration = "counter", "s", MDP(), {}
+        def init(self, key):
+            return State(np.zeros(2), np.zeros(3000), 0)
+
+    learner = Counter()
+
+    def after(session):
+        return State(np.arange(2.0) * session, np.arange(3000.0) + session, session)
+
+    def position(session):
+        here = Position()
+        for i in range(session):
+            here = here.after(f"line {i}")
+        return here
+
+    def run(path, sessions):
+        with Journal.open(path, learner) as journal:
+            here = journal.position
+            for session in range(journal.session + 1, sessions + 1):
+                here = here.after(f"line {session - 1}")
+                journal.commit(after(session), Report(session**2), here)
+    """
+)
+
+
+def child(script: str, *arguments: object) -> subprocess.Popen:
+    return subprocess.Popen(
+        [sys.executable, "-c", COUNTER + textwrap.dedent(script), *map(str, arguments)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        stdin=subprocess.PIPE,
+        text=True,
+        env=os.environ | {"JAX_PLATFORMS": "cpu"},
+    )
+
+
+def test_a_second_writer_is_refused_in_another_process_until_the_first_is_killed(tmp_path: Path) -> None:
+    first = child(
+        """
+        journal = Journal.open(sys.argv[1], learner)
+        journal.commit(after(1), Report(1))
+        print("open", flush=True)
+        sys.stdin.read()
+        """,
+        tmp_path / "j",
+    )
+    assert first.stdout.readline() == "open\n"
+    with pytest.raises(JournalBusy, match=f"{tmp_path / 'j'} is open for writing in process {first.pid} on "):
+        Journal.open(tmp_path / "j", Toy(process()))
+    with Journal.read(tmp_path / "j") as view:  # but it may be looked at
+        assert view.session == 1
+    first.kill()
+    first.communicate()
+    with pytest.raises(JournalError, match="is a journal of method 'counter'") as refused:
+        Journal.open(tmp_path / "j", Toy(process()))
+    assert not isinstance(refused.value, JournalBusy)
+
+
+def test_a_view_sees_sessions_as_they_are_committed(learner: Toy, tmp_path: Path) -> None:
+    history = learned(learner, 3)
+    with Journal.open(tmp_path / "j", learner) as journal, Journal.read(tmp_path / "j") as view:
+        assert view.session == 0
+        for state, report in history:
+            reading = view.reports()
+            journal.commit(state, report, Position().after("line"))
+            assert len(list(reading)) == view.session == state.session
+            assert view.position == journal.position
+            np.testing.assert_array_equal(view.stored_state()["statistic.counts"], state.statistic.counts)
+        assert view.origin == journal.origin
+        assert view.origin.method == "toy"
+        with pytest.raises(AttributeError):
+            view.commit(*history[0])
+    with Journal.read(tmp_path / "j") as view:
+        assert view.session == 3
+
+
+# -- what is refused ------------------------------------------------------------------------------------
+
+
+def snapshot(folder: Path) -> dict[str, bytes]:
+    return {file.name: file.read_bytes() for file in folder.iterdir() if file.is_file()}
+
+
+@pytest.mark.parametrize("kind", ["text", "database", "database with a log", "a folder", "a pipe"])
+def test_what_is_no_journal_is_left_as_it_was(kind: str, learner: Toy, tmp_path: Path) -> None:
+    path = tmp_path / "j"
+    foreign = None
+    if kind == "text":
+        path.write_text("my thesis\n" * 200)
+    elif kind == "a folder":
+        path.mkdir()
+    elif kind == "a pipe":
+        os.mkfifo(path)
+    else:
+        foreign = sqlite3.connect(path)
+        if kind == "database with a log":
+            foreign.execute("PRAGMA journal_mode=WAL")
+        foreign.execute("CREATE TABLE session (number INTEGER)")
+        foreign.commit()
+    before = snapshot(tmp_path)
+    for refused in (lambda: Journal.open(path, learner), lambda: Journal.read(path)):
+        with pytest.raises(JournalError, match=re.escape(str(path))):
+            refused()
+    assert snapshot(tmp_path) == before
+
+
+def test_a_newer_journal_is_left_as_it_was(learner: Toy, tmp_path: Path) -> None:
+    Journal.open(tmp_path / "j", learner).close()
+    with sqlite3.connect(tmp_path / "j") as connection:
+        assert connection.execute("PRAGMA application_id").fetchone() == (APPLICATION_ID,)
+        assert connection.execute("PRAGMA user_version").fetchone() == (SCHEMA_VERSION,)
+        connection.execute(f"PRAGMA user_version={SCHEMA_VERSION + 1}")
+    connection.close()
+    before = snapshot(tmp_path)
+    for refused in (lambda: Journal.open(tmp_path / "j", learner), lambda: Journal.read(tmp_path / "j")):
+        with pytest.raises(JournalError, match=f"newer i2rl .*version {SCHEMA_VERSION + 1}.*update i2rl"):
+            refused()
+    assert snapshot(tmp_path) == before
+
+
+def test_a_journal_of_something_else_is_left_as_it_was(learner: Toy, tmp_path: Path) -> None:
+    with Journal.open(tmp_path / "j", learner) as journal:
+        journal.commit(*learned(learner, 1)[0])
+    before = snapshot(tmp_path)
+    print_of = learner.mdp.fingerprint()[:12]
+    others = {
+        rf"is a journal of method 'toy' on an MDP with 3 states, 2 actions and 2 features "
+        rf"\(fingerprint {print_of}\).*what differs: MDP$": learner._replace(mdp=process(1)),
+        "this learner is method 'lme'.*what differs: method$": learner._replace(name="lme"),
+        r"what differs: step \(0.5 there, 0.25 here\)$": learner._replace(step=0.25),
+    }
+    for message, other in others.items():
+        with pytest.raises(JournalError, match=message):
+            Journal.open(tmp_path / "j", other)
+        assert snapshot(tmp_path) == before
+    Journal.open(tmp_path / "j", learner).close()  # nothing is still locked
+
+
+def test_a_state_of_another_form_is_refused(learner: Toy, tmp_path: Path) -> None:
+    class Changed(Toy):
+        def init(self, key: Any) -> Any:
+            return super().init(key)._replace(weights=jnp.zeros(5))
+
+    with Journal.open(tmp_path / "j", learner) as journal:
+        journal.commit(*learned(learner, 1)[0])
+    with pytest.raises(
+        JournalError, match=r"weights is stored as float64\[2\] where float64\[5\] is expected"
+    ):
+        Journal.open(tmp_path / "j", Changed(*learner))
+
+
+def test_a_missing_journal_or_folder_is_named(learner: Toy, tmp_path: Path) -> None:
+    with pytest.raises(JournalError, match=r"/j does not exist"):
+        Journal.read(tmp_path / "j")
+    with pytest.raises(JournalError, match=r"there is no folder .*/nowhere"):
+        Journal.open(tmp_path / "nowhere" / "j", learner)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_folder_that_cannot_be_written_is_named(learner: Toy) -> None:
+    with pytest.raises(JournalError, match=r"/proc/j cannot be locked for writing \(is its folder read-only"):
+        Journal.open("/proc/j", learner)
+
+
+def test_a_damaged_session_is_named(learner: Toy, tmp_path: Path) -> None:
+    with Journal.open(tmp_path / "j", learner) as journal:
+        for state, report in learned(learner, 2):
+            journal.commit(state, report)
+    with sqlite3.connect(tmp_path / "j") as connection:
+        connection.execute("UPDATE session SET report = substr(report, 1, 40) WHERE number = 2")
+        connection.execute("UPDATE state SET tree = substr(tree, 2)")
+    connection.close()
+    with Journal.read(tmp_path / "j") as view:
+        reading = view.reports()
+        assert next(reading).session == 1
+        with pytest.raises(JournalError, match="session 2 cannot be read: the bytes are damaged"):
+            next(reading)
+    with pytest.raises(JournalError, match="the state after session 2 cannot be read"):
+        Journal.open(tmp_path / "j", learner)
+
+
+# -- when things break ----------------------------------------------------------------------------------
+
+
+def test_a_full_disk_keeps_what_was_committed_and_the_learner_may_go_on(tmp_path: Path) -> None:
+    writer = child(
+        """
+        import resource
+        journal = Journal.open(sys.argv[1], learner)
+        for session in range(1, 4):
+            journal.commit(after(session), Report(session**2), position(session))
+        room = os.path.getsize(sys.argv[1] + "-wal")
+        for extra in (1, 5000, 20000):  # not even one page, or not all of them
+            resource.setrlimit(resource.RLIMIT_FSIZE, (room + extra, -1))
+            for session in (4, 5):
+                try:
+                    journal.commit(after(session), Report(session**2), position(session))
+                except JournalError as error:
+                    print(error)
+                assert journal.session == 3 and journal.position == position(3)
+                assert [record.session for record in journal.reports()] == [1, 2, 3]
+        resource.setrlimit(resource.RLIMIT_FSIZE, (-1, -1))
+        journal.commit(after(5), Report(25), position(5))
+        os._exit(0)  # without closing
+        """,
+        tmp_path / "j",
+    )
+    output, errors = writer.communicate(timeout=60)
+    assert writer.returncode == 0, errors
+    message = rf"{tmp_path / 'j'} cannot take session [45] \(what was committed up to session 3 is safe\): .*"
+    assert len(re.findall(message, output)) == 6
+    with Journal.read(tmp_path / "j") as view:
+        assert [record.session for record in view.reports()] == [1, 2, 3, 5]
+        np.testing.assert_array_equal(view.stored_state()["statistic"], np.arange(3000.0) + 5)
+
+
+def test_sqlite_out_of_pages_is_a_full_disk_too(learner: Toy, tmp_path: Path) -> None:
+    history = learned(learner, 3)
+    with Journal.open(tmp_path / "j", learner) as journal:
+        journal.commit(*history[0])
+        journal._connection.execute("PRAGMA max_page_count=1")  # SQLite sets it to the present size
+        large = history[1][0]._replace(warm=jnp.ones((200, 200)))
+        with pytest.raises(JournalError, match=r"cannot take session 2 \(.*session 1 is safe\): .*full"):
+            journal.commit(large, history[1][1])
+        assert bits(journal.state) == bits(history[0][0])
+        journal._connection.execute("PRAGMA max_page_count=100000")
+        journal.commit(*history[1])
+    with Journal.open(tmp_path / "j", learner) as journal:
+        assert bits(journal.state) == bits(history[1][0])
+
+
+def test_a_commit_that_fails_half_way_leaves_nothing(learner: Toy, tmp_path: Path) -> None:
+    history = learned(learner, 2)
+    with Journal.open(tmp_path / "j", learner) as journal:
+        journal.commit(*history[0])
+        journal._connection.execute(
+            "CREATE TEMP TRIGGER broken BEFORE INSERT ON main.state BEGIN SELECT RAISE(FAIL, 'broken'); END"
+        )
+        with pytest.raises(JournalError, match=r"cannot take session 2 .*: broken"):
+            journal.commit(*history[1])
+        assert journal.session == 1
+        assert [record.session for record in journal.reports()] == [1]
+        journal._connection.execute("DROP TRIGGER broken")
+        journal.commit(*history[1])
+        assert [record.session for record in journal.reports()] == [1, 2]
+
+
+def test_a_killed_writer_loses_no_session_and_repeats_none(tmp_path: Path) -> None:
+    # Forks from one process that has imported everything; each fork resumes, checks and commits on until it
+    # is killed, the first of them possibly while it still makes the file.
+    keeper = child(
+        """
+        def check(path):
+            with Journal.open(path, learner) as journal:
+                n = journal.session
+                assert journal.position == position(n), (n, journal.position)
+                assert [record.session for record in journal.reports()] == list(range(1, n + 1))
+                assert all(r.report == {"square": r.session**2} for r in journal.reports())
+                assert all((r.weights == np.arange(2.0) * r.session).all() for r in journal.reports())
+                stored = journal.stored_state()
+                if n:
+                    assert stored["session"] == n and (stored["statistic"] == np.arange(3000.0) + n).all()
+                return n
+
+        def kill_a_writer(path, longest):
+            pid = os.fork()
+            if not pid:
+                try:
+                    run(path, 10**9)
+                except BaseException as error:
+                    print("child:", repr(error), file=sys.stderr, flush=True)
+                os._exit(1)
+            time.sleep(random.uniform(0, longest))
+            os.kill(pid, signal.SIGKILL)
+            assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == -signal.SIGKILL
+
+        random.seed(2024)
+        path, last = sys.argv[1], [0]
+        for kill in range(24):
+            kill_a_writer(path, 0.02 if kill % 2 else 0.15)
+            if kill % 4 == 1:  # otherwise the next writer finds what the killed one left
+                with Journal.read(path) as view:
+                    seen = view.session
+                last.append(check(path))
+                assert seen == last[-1]
+        print(*last)
+        for fresh in range(12):  # killed while the file is being made
+            kill_a_writer(f"{path}-{fresh}", 0.015)
+            n = check(f"{path}-{fresh}")
+            run(f"{path}-{fresh}", n + 2)
+            assert check(f"{path}-{fresh}") == n + 2
+        """,
+        tmp_path / "j",
+    )
+    output, errors = keeper.communicate(timeout=120)
+    assert keeper.returncode == 0, errors
+    assert "child:" not in errors
+    sessions = [int(n) for n in output.split()]
+    assert sessions == sorted(sessions)
+    assert sessions[-1] > 20  # it did learn in between
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_log_cut_anywhere_leaves_whole_sessions(seed: int, learner: Toy, tmp_path: Path) -> None:
+    # What a power cut may leave of the newest commits: the log up to some byte, and noise behind it.
+    history = learned(learner, 5)
+    rng = np.random.default_rng(seed)
+    with Journal.open(tmp_path / "j", learner) as journal:
+        for state, report in history:
+            journal.commit(state, report, Position(state.session, "00"))
+        main, log = (tmp_path / "j").read_bytes(), (tmp_path / "j-wal").read_bytes()
+    reached = set()
+    for cut in rng.integers(0, len(log) + 1, size=25):
+        cut_path = tmp_path / "cut" / "j"
+        shutil.rmtree(cut_path.parent, ignore_errors=True)
+        cut_path.parent.mkdir()
+        cut_path.write_bytes(main)
+        cut_path.with_name("j-wal").write_bytes(log[:cut] + rng.bytes(rng.integers(0, 5000)))
+        with Journal.open(cut_path, learner) as journal:
+            n = journal.session
+            assert [record.session for record in journal.reports()] == list(range(1, n + 1))
+            assert journal.position.records == n
+            assert bits(journal.state) == (bits(history[n - 1][0]) if n else bits(None))
+        reached.add(n)
+    assert len(reached) > 2
+
+
+def test_a_commit_is_flushed_to_the_disk(learner: Toy, tmp_path: Path) -> None:
+    with Journal.open(tmp_path / "j", learner) as journal:
+        assert journal._connection.execute("PRAGMA synchronous").fetchone() == (2,)
+        assert journal._connection.execute("PRAGMA journal_mode").fetchone() == ("wal",)
+
+
+# -- export ---------------------------------------------------------------------------------------------
+
+
+def test_the_history_leaves_as_inference_data(learner: Toy, tmp_path: Path) -> None:
+    history = learned(learner, 3)
+    with Journal.open(tmp_path / "j", learner) as journal:
+        for state, report in history:
+            journal.commit(state, report, Position(10 * state.session, "00"))
+        journal.to_netcdf(tmp_path / "history.nc")
+    data = arviz.from_netcdf(tmp_path / "history.nc")
+    assert data.groups() == ["sessions"]
+    sessions = data["sessions"].load()
+    assert sessions.weights.dims == ("session", "feature")
+    assert list(sessions.session.values) == [1, 2, 3]
+    assert list(sessions.feature.values) == ["near", "far"]
+    np.testing.assert_array_equal(sessions.weights, [state.weights for state, _ in history])
+    np.testing.assert_array_equal(
+        sessions.log_likelihood, [float(report.log_likelihood) for _, report in history]
+    )
+    np.testing.assert_array_equal(sessions.gap, [report.gap for _, report in history])
+    np.testing.assert_array_equal(sessions.found, [[np.nan] * 3, [0, 1, np.nan], [0, 1, 2]])
+    assert list(sessions.status.values) == ["converged"] * 3
+    assert list(sessions.records.values) == [10, 20, 30]
+    assert np.all(np.abs(sessions.committed.values - np.datetime64("now")) < np.timedelta64(1, "h"))
+    assert sessions.attrs["method"] == "toy"
+    assert sessions.attrs["mdp_fingerprint"] == learner.mdp.fingerprint()
+    data.close()
+
+
+def test_an_empty_history_leaves_as_inference_data(learner: Toy, tmp_path: Path) -> None:
+    with Journal.open(tmp_path / "j", learner) as journal:
+        assert journal.to_inference_data()["sessions"].sizes["session"] == 0
