@@ -1,7 +1,7 @@
 """Maximum causal entropy inverse reinforcement learning over a finite horizon, in a known tabular process.
 
 Among all (time-dependent) policies that collect the expert's features, the one of greatest causal entropy
-is the soft policy of some reward ``theta . phi`` (Ziebart 2010, Theorem 6.8 and Algorithm 9.1), and
+is the soft policy of some reward ``theta . phi`` (Ziebart 2010, chapters 6 and 9), and
 ``theta`` minimises the convex dual
 
     D(theta) = E_{p0}[V_theta(s_0)] - theta . phi_hat,
@@ -54,7 +54,7 @@ class CausalEntropyFit(NamedTuple):
     gap : float ``[K]``
         What the policy collects minus what was asked for; at most the tolerance everywhere.
     value : float
-        The dual ``D(theta)``; at the optimum, the causal entropy of the policy found, in nats.
+        The dual ``D(theta)``; at the optimum, the (discounted) causal entropy of the policy, in nats.
     evaluations : int
         Pairs of sweeps made (Hessians are not counted).
     """
