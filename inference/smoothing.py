@@ -63,24 +63,21 @@ def smooth_all(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evide
     return jax.vmap(lambda e, live: smooth(mdp, e + log_policy, live))(*evidence)
 
 
-def log_likelihoods(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Float[Array, " n"]:
+def log_likelihoods(
+    mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence
+) -> Float[Array, " n"]:
     """Exact log-likelihood of each trajectory."""
     return jax.vmap(lambda e, live: filter_forward(mdp, e + log_policy, live).log_likelihood)(*evidence)
 
 
 def expectations(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Expectations:
     """The exact E-step (Eq. 4.1 with the sum over completions carried out)."""
-    posterior = smooth_all(mdp, log_policy, evidence)
-    return _collect(mdp, posterior.pairs, posterior.final, posterior.log_likelihood, evidence.live)
+    return collect(mdp, smooth_all(mdp, log_policy, evidence), evidence.live)
 
 
-def _collect(
-    mdp: TabularMDP,
-    pairs: Float[Array, "n L S A"],
-    final: Float[Array, "n S"],
-    log_likelihood: Float[Array, " n"],
-    live: Bool[Array, "n L"],
-) -> Expectations:
+def collect(mdp: TabularMDP, posterior: Smoothed, live: Bool[Array, "n L"]) -> Expectations:
+    """Sum a posterior over hidden pairs (exact or estimated) into expected sufficient statistics."""
+    log_likelihood, pairs, final = posterior
     powers = mdp.discount ** jnp.arange(live.shape[1])
     exists = jnp.any(live, axis=1)
     discounted = jnp.einsum("nlsa,l->sa", pairs, powers)
@@ -110,12 +107,32 @@ def sample_completions(
     return jax.vmap(one, out_axes=1)(keys, *evidence)
 
 
+def blocked_posterior(
+    key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, draws: int
+) -> Smoothed:
+    """:func:`smooth_all` estimated from ``draws`` independent joint completions of each trajectory."""
+    states, actions = sample_completions(key, mdp, log_policy, evidence, draws)
+    return _average(mdp, log_policy, evidence, states, actions)
+
+
+def gibbs_posterior(
+    key: Array,
+    mdp: TabularMDP,
+    log_policy: Float[Array, "S A"],
+    evidence: Evidence,
+    draws: int,
+    burn_in: int = 20,
+) -> Smoothed:
+    """:func:`smooth_all` estimated by ``draws`` sweeps of the single-site Gibbs sampler."""
+    states, actions = gibbs_completions(key, mdp, log_policy, evidence, draws, burn_in)
+    return _average(mdp, log_policy, evidence, states, actions)
+
+
 def blocked_expectations(
     key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, draws: int
 ) -> Expectations:
     """:func:`expectations` estimated from ``draws`` independent joint completions."""
-    states, actions = sample_completions(key, mdp, log_policy, evidence, draws)
-    return _from_completions(mdp, log_policy, evidence, states, actions)
+    return collect(mdp, blocked_posterior(key, mdp, log_policy, evidence, draws), evidence.live)
 
 
 def gibbs_expectations(
@@ -127,8 +144,7 @@ def gibbs_expectations(
     burn_in: int = 20,
 ) -> Expectations:
     """:func:`expectations` estimated by ``draws`` sweeps of the single-site Gibbs sampler."""
-    states, actions = gibbs_completions(key, mdp, log_policy, evidence, draws, burn_in)
-    return _from_completions(mdp, log_policy, evidence, states, actions)
+    return collect(mdp, gibbs_posterior(key, mdp, log_policy, evidence, draws, burn_in), evidence.live)
 
 
 def gibbs_completions(
@@ -139,15 +155,15 @@ def gibbs_completions(
     draws: int,
     burn_in: int = 20,
 ) -> tuple[Int[Array, "draws n L"], Int[Array, "draws n L"]]:
-    """Completions by single-site Gibbs: each sweep redraws every state, then its action, given both neighbours.
+    """Completions by single-site Gibbs: a sweep redraws every state, then its action, given both neighbours.
 
     The dissertation's MCMC. Unlike its released code, the look-ahead factor ``P(s_{t+1} | s_t, a_t)``
     enters at every step. Where the dynamics are nearly deterministic a single site cannot move, so it
     mixes poorly or not at all: an inherent limit of the sampler, and why it is not the default. The chain
-    starts from a completion drawn under the uniform policy.
+    starts from a completion drawn under the uniform policy over the actions that ``log_policy`` may take.
     """
     n_states = mdp.n_states
-    uniform = jnp.where(mdp.available, 0.0, -jnp.inf)
+    uniform = jnp.where(log_policy > -jnp.inf, 0.0, -jnp.inf)
     log_initial = jnp.log(mdp.initial)
 
     def chain(key: Array, e: Array, live: Array) -> tuple:
@@ -185,13 +201,13 @@ def gibbs_completions(
     return jax.vmap(chain, out_axes=1)(keys, *evidence)
 
 
-def _from_completions(
+def _average(
     mdp: TabularMDP,
     log_policy: Float[Array, "S A"],
     evidence: Evidence,
     states: Int[Array, "draws n L"],
     actions: Int[Array, "draws n L"],
-) -> Expectations:
+) -> Smoothed:
     draws = states.shape[0]
     n, length = evidence.live.shape
 
@@ -204,4 +220,4 @@ def _from_completions(
     pairs = jnp.where(evidence.live[..., None, None], pairs, 0.0)
     last = jnp.maximum(jnp.sum(evidence.live, axis=1) - 1, 0)
     final = jax.vmap(mdp.push_forward)(pairs[jnp.arange(n), last])
-    return _collect(mdp, pairs, final, log_likelihoods(mdp, log_policy, evidence), evidence.live)
+    return Smoothed(log_likelihoods(mdp, log_policy, evidence), pairs, final)

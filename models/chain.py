@@ -2,7 +2,8 @@
 
 Behaviour is ``p0(s_0) prod_t pi(a_t | s_t) P(s_{t+1} | s_t, a_t)``; evidence multiplies it step by step.
 Policy and evidence enter only through their product, the factors ``log pi(a | s) + log e_t(s, a)`` given
-as ``[L, S, A]``. One pass costs ``O(L S A B)``.
+as ``[L, S, A]``. One pass costs ``O(L S A B)``. Each step is normalised, so length never underflows; a
+state less than 1e-308 times as likely as all that is known of its step counts as impossible.
 """
 
 from __future__ import annotations
@@ -56,9 +57,7 @@ def _weigh(predicted: Float[Array, " S"], factors: Float[Array, "S A"]) -> tuple
     return joint, jnp.sum(joint), scale
 
 
-def filter_forward(
-    mdp: TabularMDP, factors: Float[Array, "L S A"], live: Bool[Array, " L"]
-) -> Filtered:
+def filter_forward(mdp: TabularMDP, factors: Float[Array, "L S A"], live: Bool[Array, " L"]) -> Filtered:
     """Forward pass; ``live`` is false on padding. Differentiable in factors, transitions and ``p0``."""
 
     def step(carry: tuple, inputs: tuple) -> tuple:
@@ -72,7 +71,8 @@ def filter_forward(
         carry = (jnp.where(alive, following, predicted), total + jnp.where(alive, log_norm, 0.0))
         return carry, predicted
 
-    (final, total), predicted = lax.scan(step, (mdp.initial, jnp.zeros(())), (factors, live))
+    carry: tuple = lax.scan(step, (mdp.initial, jnp.zeros(())), (factors, live))
+    (final, total), predicted = carry
     return Filtered(total, predicted, final)
 
 
@@ -87,13 +87,13 @@ def smooth(mdp: TabularMDP, factors: Float[Array, "L S A"], live: Bool[Array, " 
         joint = joint * onward
         total = jnp.sum(joint)
         pairs = joint / jnp.where(total > 0, total, 1.0)
-        # Only states that can occur matter: the rest are bounded so that they cannot overflow.
-        message = jnp.sum(_bounded_exp(factor - scale) * onward, axis=1)
-        message = message / jnp.maximum(jnp.max(jnp.where(predicted > 0, message, 0.0)), 1e-300)
+        # Only states that can occur matter: the others' messages would grow without bound.
+        message = jnp.where(predicted > 0, jnp.sum(_bounded_exp(factor - scale) * onward, axis=1), 0.0)
+        message = message / jnp.maximum(jnp.max(message), 1e-300)
         return jnp.where(alive, message, future), jnp.where(alive, pairs, 0.0)
 
     ones = jnp.ones(mdp.n_states)
-    _, pairs = lax.scan(step, ones, (filtered.predicted, factors, live), reverse=True)
+    pairs: Array = lax.scan(step, ones, (filtered.predicted, factors, live), reverse=True)[1]
     return Smoothed(filtered.log_likelihood, pairs, filtered.final)
 
 
@@ -115,5 +115,4 @@ def sample_backward(
 
     keys = jax.random.split(key, factors.shape[0])
     start = (jnp.array(0), jnp.array(False))
-    _, (states, actions) = lax.scan(step, start, (keys, filtered.predicted, factors, live), reverse=True)
-    return states, actions
+    return lax.scan(step, start, (keys, filtered.predicted, factors, live), reverse=True)[1]

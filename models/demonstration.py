@@ -77,6 +77,10 @@ class Demonstration(NamedTuple):
         """Fully observed trajectories of one length."""
         states = np.atleast_2d(np.asarray(states, np.int32))
         actions = np.atleast_2d(np.asarray(actions, np.int32))
+        if states.shape != actions.shape:
+            raise ValueError(
+                f"states and actions must have one shape, got {states.shape} and {actions.shape}"
+            )
         return Demonstration(
             np.full(states.shape, SEEN, np.int8), states, actions, np.full(states.shape, np.nan)
         )
@@ -102,7 +106,9 @@ class Demonstration(NamedTuple):
         """The same demonstration in a larger array, so that one compiled program serves many sizes."""
         n, width = self.kind.shape
         if n > n_trajectories or width > length:
-            raise ValueError(f"a demonstration of shape {(n, width)} does not fit into {(n_trajectories, length)}")
+            raise ValueError(
+                f"a demonstration of shape {(n, width)} does not fit into {(n_trajectories, length)}"
+            )
         grow = ((0, n_trajectories - n), (0, length - width))
         fills = (PAD, UNKNOWN, UNKNOWN, np.nan)
         return Demonstration(
@@ -181,7 +187,9 @@ class _Names:
                 raise DemonstrationError(f"{where}: unknown {kind} {value!r}; known are {known}, ...")
             return index
         if not 0 <= value < count:
-            raise DemonstrationError(f"{where}: {kind} {value} is out of range; indices run from 0 to {count - 1}")
+            raise DemonstrationError(
+                f"{where}: {kind} {value} is out of range; indices run from 0 to {count - 1}"
+            )
         return int(value)
 
     def step(self, step: Step, where: str) -> tuple[int, int, int, float]:
@@ -189,15 +197,17 @@ class _Names:
             return LOST, UNKNOWN, UNKNOWN, math.nan
         if step == "hidden":
             return HIDDEN, UNKNOWN, UNKNOWN, math.nan
-        if isinstance(step, tuple):
+        if isinstance(step, tuple) and len(step) == 2:
             step = {"s": step[0], "a": step[1]}
         if not isinstance(step, dict):
             raise DemonstrationError(
-                f'{where}: a step is {{"s": ..., "a": ...}}, "hidden" or null (a lost frame), got {step!r}'
+                f'{where}: a step is {{"s": ..., "a": ...}}, "hidden" or null for a lost frame, got {step!r}'
             )
         unknown = set(step) - {"s", "a", "score"}
         if unknown:
-            raise DemonstrationError(f"{where}: unknown field {sorted(unknown)[0]!r}; a step has s, a and score")
+            raise DemonstrationError(
+                f"{where}: unknown field {sorted(unknown)[0]!r}; a step has s, a and score"
+            )
         if step.get("s") is None and step.get("a") is None:
             raise DemonstrationError(f'{where}: a seen step needs "s" or "a"; write "hidden" or null instead')
         state = UNKNOWN if step.get("s") is None else self.resolve(step["s"], "state", where)
@@ -205,7 +215,7 @@ class _Names:
         score = step.get("score")
         if score is None:
             return SEEN, state, action, math.nan
-        if isinstance(score, bool) or not isinstance(score, int | float) or not 0 <= score <= 1:
+        if isinstance(score, bool) or not isinstance(score, int | float | np.number) or not 0 <= score <= 1:
             raise DemonstrationError(f"{where}: score must lie in [0, 1], got {score!r}")
         return SEEN, state, action, float(score)
 
@@ -241,12 +251,16 @@ def read_trajectories(lines: Iterable[str], mdp: TabularMDP, source: str = "inpu
             content = json.loads(line)
         except json.JSONDecodeError as error:
             ending = "" if line.endswith("\n") else " (the line has no end: the file may have been cut off)"
-            raise DemonstrationError(f"{where}: not valid JSON at character {error.pos + 1}: {error.msg}{ending}") from None
+            raise DemonstrationError(
+                f"{where}: not valid JSON at character {error.pos + 1}: {error.msg}{ending}"
+            ) from None
         identity = agent = None
         if isinstance(content, dict):
             unknown = set(content) - {"steps", "id", "agent"}
             if unknown:
-                raise DemonstrationError(f"{where}: unknown field {sorted(unknown)[0]!r}; a trajectory has steps, id and agent")
+                raise DemonstrationError(
+                    f"{where}: unknown field {sorted(unknown)[0]!r}; a trajectory has steps, id and agent"
+                )
             if "steps" not in content:
                 raise DemonstrationError(f'{where}: a trajectory needs the field "steps"')
             identity = None if content.get("id") is None else str(content["id"])
@@ -268,9 +282,20 @@ def write_trajectories(
     ids: Sequence[str] | None = None,
     agents: Sequence[int] | None = None,
 ) -> None:
-    """Write trajectories as JSON Lines, by name where the MDP has names, otherwise by index."""
+    """Write trajectories as JSON Lines, by name where the MDP has names, otherwise by index.
+
+    Rows that are all padding are no trajectories and are left out. ``ids`` and ``agents`` have an entry for
+    every row; ``ValueError`` if not.
+    """
+    for field, given in (("ids", ids), ("agents", agents)):
+        if given is not None and len(given) != demonstration.n_trajectories:
+            raise ValueError(
+                f"{len(given)} {field} were given for {demonstration.n_trajectories} trajectories"
+            )
     states, actions = mdp.labels.states, mdp.labels.actions
     for i, total in enumerate(demonstration.lengths):
+        if not total:
+            continue
         steps: list[Any] = []
         for t in range(int(total)):
             kind, s, a, score = (x[i, t] for x in demonstration)

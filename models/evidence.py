@@ -34,7 +34,7 @@ class Imperfection(Protocol):
 class _Composable:
     """Products of imperfections."""
 
-    def __mul__(self: Imperfection, other: Imperfection) -> Sensor:  # type: ignore[misc]
+    def __mul__(self: Imperfection, other: Imperfection) -> Sensor:
         if self.reading is not None and other.reading is not None:
             raise ValueError("a sensor has one reading: two observation models cannot be multiplied")
         if self.presence is None or other.presence is None:
@@ -69,12 +69,19 @@ class Visibility(_Composable, _VisibilityFields):  # type: ignore[misc]
 
     def __new__(cls, in_view: np.ndarray | Array) -> Visibility:
         """Check and convert ``in_view``; ``ValueError`` if it is no probability."""
-        if not isinstance(in_view, jax.core.Tracer) and not isinstance(in_view, jax.Array):
+        # Only what a user would write is checked: JAX rebuilds this tuple around its own placeholders.
+        if isinstance(in_view, np.ndarray | list | tuple):
             array = np.asarray(in_view, dtype=float)
-            if array.ndim != 1 or not ((array >= 0) & (array <= 1)).all():
-                raise ValueError(f"in_view must be a mask or probabilities of shape [S], got shape {array.shape}")
+            if array.ndim != 1:
+                raise ValueError(f"in_view must have shape [S], got {array.shape}")
+            wrong = ~((array >= 0) & (array <= 1))
+            if wrong.any():
+                s = int(np.flatnonzero(wrong)[0])
+                raise ValueError(
+                    f"in_view must be a mask or probabilities in [0, 1]; that of state {s} is {array[s]}"
+                )
             in_view = jnp.asarray(array)
-        return super().__new__(cls, in_view)  # type: ignore[call-arg]
+        return super().__new__(cls, in_view)
 
     @property
     def presence(self) -> Float[Array, " S"]:
@@ -118,7 +125,9 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
     @staticmethod
     def from_factors(states: np.ndarray, actions: np.ndarray) -> ObservationModel:
         """States and actions confused independently: ``O = O_s(o_s | s) O_a(o_a | a)``."""
-        return ObservationModel.from_probabilities(np.einsum("so,ap->saop", np.asarray(states), np.asarray(actions)))
+        return ObservationModel.from_probabilities(
+            np.einsum("so,ap->saop", np.asarray(states), np.asarray(actions))
+        )
 
     @property
     def presence(self) -> None:
@@ -137,9 +146,10 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
         del score  # a fixed confusion takes no account of confidence
         table = self.log_probabilities
         by_state = jnp.where(
-            state == UNKNOWN, jax.nn.logsumexp(table, axis=2), table[:, :, jnp.maximum(state, 0)]
+            state == UNKNOWN, _log(jnp.sum(jnp.exp(table), axis=2)), table[:, :, jnp.maximum(state, 0)]
         )
-        return jnp.where(action == UNKNOWN, jax.nn.logsumexp(by_state, axis=2), by_state[:, :, action])
+        summed = _log(jnp.sum(jnp.exp(by_state), axis=2))
+        return jnp.where(action == UNKNOWN, summed, by_state[:, :, jnp.maximum(action, 0)])
 
     def report(
         self, key: Array, state: Int[Array, ""], action: Int[Array, ""]
@@ -148,6 +158,20 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
         flat = jax.random.categorical(key, self.log_probabilities[state, action].reshape(-1))
         n_actions = self.log_probabilities.shape[1]
         return flat // n_actions, flat % n_actions
+
+
+def require_fitting(sensor: Imperfection, mdp: TabularMDP) -> None:
+    """Raise ``ValueError`` if a sensor was made for another number of states or actions than the MDP has."""
+    if sensor.presence is not None and sensor.presence.shape[-1:] != (mdp.n_states,):
+        raise ValueError(
+            f"the sensor's view has shape {sensor.presence.shape}, but the MDP has {mdp.n_states} states"
+        )
+    table = getattr(sensor.reading, "log_probabilities", None)
+    if table is not None and table.shape[-2:] != (mdp.n_states, mdp.n_actions):
+        raise ValueError(
+            f"the observation model is about {table.shape[-2]} states and {table.shape[-1]} actions, "
+            f"but the MDP has {mdp.n_states} and {mdp.n_actions}"
+        )
 
 
 def step_log_evidence(
@@ -178,8 +202,14 @@ def _log(probability: Array) -> Array:
     return jnp.where(probability > 0, jnp.log(jnp.where(probability > 0, probability, 1.0)), -jnp.inf)
 
 
-def log_evidence(sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration) -> Float[Array, "n L S A"]:
-    """``log e_t(s, a)`` of every step of every trajectory."""
+def log_evidence(
+    sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration
+) -> Float[Array, "n L S A"]:
+    """``log e_t(s, a)`` of every step of every trajectory.
+
+    Raises ``ValueError`` for a sensor made for another number of states or actions.
+    """
+    require_fitting(sensor, mdp)
     step = jax.vmap(jax.vmap(lambda *x: step_log_evidence(sensor, mdp.n_states, mdp.n_actions, *x)))
     kind, state, action, score = (jnp.asarray(x) for x in demonstration)
     return step(kind, state, action, score)
@@ -203,33 +233,43 @@ def observe(
     return jax.vmap(one)(jax.random.split(key, states.shape[0]), states, actions)
 
 
+_evidence = jax.jit(step_log_evidence, static_argnums=(1, 2))
+
+
 def require_possible(
     sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration, record: str = "trajectory"
 ) -> None:
     """Raise :class:`DemonstrationError` at the first step that no behaviour of the MDP could have produced.
 
-    Follows the set of states that could still be true; ``record`` names what a row is in the message.
+    Follows the set of states that could still be true; ``record`` names what a row is in the message. An
+    index of no state or action is such a step too.
     """
+    require_fitting(sensor, mdp)
     successors, possible_move = np.asarray(mdp.successors), np.asarray(mdp.probabilities) > 0
     available = np.asarray(mdp.available)
     name = _PairNames(mdp.labels)
     names = {SEEN: "seen", HIDDEN: "hidden", LOST: "lost"}
     start = np.asarray(mdp.initial) > 0
-    evidence = jax.jit(step_log_evidence, static_argnums=(1, 2)) if sensor.reading is not None else None
     presence = np.ones(mdp.n_states) if sensor.presence is None else np.asarray(sensor.presence)
     for i in range(demonstration.n_trajectories):
         states = start
         for t, (kind, s, a, score) in enumerate(zip(*(np.asarray(x)[i] for x in demonstration), strict=True)):
             if kind == PAD:
                 break
-            if kind == SEEN and evidence is None:
+            for index, what, count in ((s, "state", mdp.n_states), (a, "action", mdp.n_actions)):
+                if kind == SEEN and not UNKNOWN <= index < count:
+                    raise DemonstrationError(
+                        f"{record} {i}, step {t}: {what} {index} is out of range; "
+                        f"indices run from 0 to {count - 1}"
+                    )
+            if kind == SEEN and sensor.reading is None:
                 pairs = np.zeros_like(available)
-                rows = slice(None) if s == UNKNOWN else slice(s, s + 1)
-                columns = slice(None) if a == UNKNOWN else slice(a, a + 1)
-                pairs[rows, columns] = True
+                pairs[slice(None) if s == UNKNOWN else s, slice(None) if a == UNKNOWN else a] = True
                 pairs &= (presence > 0)[:, None]
-            elif kind == SEEN and evidence is not None:
-                pairs = np.asarray(evidence(sensor, mdp.n_states, mdp.n_actions, kind, s, a, score)) > -np.inf
+            elif kind == SEEN:
+                pairs = (
+                    np.asarray(_evidence(sensor, mdp.n_states, mdp.n_actions, kind, s, a, score)) > -np.inf
+                )
             elif kind == HIDDEN:
                 pairs = np.broadcast_to((presence < 1)[:, None], available.shape)
             else:
@@ -243,7 +283,7 @@ def require_possible(
                         + ([] if a == UNKNOWN else [f"action {name.action(a)}"])
                     )
                 if not pairs.any():
-                    reason = "the view excludes it" if kind == SEEN else "every state is in view"
+                    reason = "the sensor excludes it" if kind == SEEN else "every state is in view"
                 elif not allowed.any():
                     reason = "the action is not available there"
                 elif t == 0:
@@ -253,6 +293,6 @@ def require_possible(
                 raise DemonstrationError(
                     f"{record} {i}, step {t}: impossible observation: {names[int(kind)]}{seen}; {reason}"
                 )
-            rows, columns = np.nonzero(allowed & states[:, None])
+            taken = allowed & states[:, None]
             states = np.zeros(mdp.n_states, bool)
-            states[successors[rows, columns][possible_move[rows, columns]]] = True
+            states[successors[taken][possible_move[taken]]] = True

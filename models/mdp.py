@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import hashlib
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -41,6 +43,10 @@ class Labels:
             return False
         return (self.states, self.actions, self.features) == (other.states, other.actions, other.features)
 
+    def __reduce__(self) -> tuple:
+        # Hashes of strings differ between processes: rebuild rather than carry one over.
+        return Labels, (self.states, self.actions, self.features)
+
 
 @partial(
     jax.tree_util.register_dataclass,
@@ -50,12 +56,13 @@ class Labels:
     ],
     meta_fields=["labels"],
 )  # fmt: skip
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class TabularMDP:
     """A finite MDP without a reward, ``<S, A, P, phi, gamma, p0>`` (Definition 1), as successor lists.
 
     Built by :meth:`from_successors`, :meth:`from_dense` or :meth:`from_sparse`, which check it once;
-    immutable, and a JAX pytree, so it passes through ``jit``, ``vmap`` and ``grad``.
+    immutable, and a JAX pytree, so it passes through ``jit``, ``vmap`` and ``grad``. Compared by identity;
+    :meth:`fingerprint` compares contents.
 
     Attributes
     ----------
@@ -121,25 +128,32 @@ class TabularMDP:
         n_states, n_actions, _ = successors.shape
         if min(successors.shape) == 0:
             raise ValueError(f"an MDP needs at least one state, action and successor, got {successors.shape}")
+        if not np.issubdtype(successors.dtype, np.integer):
+            raise ValueError(f"successors must be integers (indices of states), got {successors.dtype}")
         labels = _checked_labels(states, actions, feature_names, n_states, n_actions, features)
         name = _PairNames(labels)
         if features.ndim != 3 or features.shape[:2] != (n_states, n_actions) or features.shape[2] == 0:
             raise ValueError(
-                f"features must have shape [S, A, K] = [{n_states}, {n_actions}, K >= 1], got {features.shape}"
+                f"features must have shape [S, A, K] = [{n_states}, {n_actions}, K >= 1], "
+                f"got {features.shape}"
             )
         available = np.ones((n_states, n_actions), bool) if available is None else np.asarray(available)
         if available.shape != (n_states, n_actions) or available.dtype != bool:
             raise ValueError(
-                f"available must be a boolean array [{n_states}, {n_actions}], got {available.dtype} {available.shape}"
+                f"available must be a boolean array [{n_states}, {n_actions}], "
+                f"got {available.dtype} {available.shape}"
             )
         if not available.any(1).all():
             s = int(np.flatnonzero(~available.any(1))[0])
             raise ValueError(
-                f"state {name.state(s)} has no available action; an absorbing state needs an action that stays there"
+                f"state {name.state(s)} has no available action; an absorbing state needs an action that "
+                "stays there"
             )
         if not np.isfinite(features[available]).all():
             s, a, k = np.argwhere(~np.isfinite(features) & available[..., None])[0]
-            raise ValueError(f"feature {name.feature(k)} of {name.pair(s, a)} is {features[s, a, k]}, not a number")
+            raise ValueError(
+                f"feature {name.feature(k)} of {name.pair(s, a)} is {features[s, a, k]}, not a number"
+            )
         _check_transitions(successors, probabilities, available, n_states, name)
         if not 0 < discount <= 1:
             raise ValueError(f"discount must lie in (0, 1], got {discount}")
@@ -148,12 +162,15 @@ class TabularMDP:
             raise ValueError(f"initial must have shape [{n_states}], got {initial.shape}")
         if not np.isfinite(initial).all() or (initial < 0).any() or abs(initial.sum() - 1) > 1e-8:
             raise ValueError(
-                f"initial must be a distribution over states: its least value is {initial.min()}, its sum {initial.sum()}"
+                f"initial must be a distribution over states: its least value is {initial.min()}, "
+                f"its sum {initial.sum()}"
             )
         # Unavailable pairs lead nowhere: they keep their place with zero probability and zero features.
         probabilities = np.where(available[..., None], probabilities, 0.0)
         features = np.where(available[..., None], features, 0.0)
-        successors = np.where(probabilities > 0, successors, np.arange(n_states)[:, None, None]).astype(np.int32)
+        successors = np.where(probabilities > 0, successors, np.arange(n_states)[:, None, None]).astype(
+            np.int32
+        )
         inflow = _inflow(successors, probabilities)
         return TabularMDP(
             successors=jnp.asarray(successors),
@@ -168,7 +185,7 @@ class TabularMDP:
         )
 
     @staticmethod
-    def from_dense(transitions: np.ndarray, features: np.ndarray, **options: object) -> TabularMDP:
+    def from_dense(transitions: np.ndarray, features: np.ndarray, **options: Any) -> TabularMDP:
         """Build an MDP from dense transitions ``[S, A, S]``; options as for :meth:`from_successors`."""
         transitions = np.asarray(transitions, dtype=float)
         if transitions.ndim != 3 or transitions.shape[0] != transitions.shape[2]:
@@ -181,7 +198,7 @@ class TabularMDP:
     def from_sparse(
         transitions: sparse.sparray | sparse.spmatrix | Sequence[sparse.sparray | sparse.spmatrix],
         features: np.ndarray,
-        **options: object,
+        **options: Any,
     ) -> TabularMDP:
         """Build an MDP from SciPy-sparse transitions.
 
@@ -190,18 +207,20 @@ class TabularMDP:
         """
         if not sparse.issparse(transitions):
             blocks = [sparse.csr_array(block) for block in transitions]
+            if not blocks:
+                raise ValueError("sparse transitions need at least one action's matrix, got none")
             n_states, n_actions = blocks[0].shape[0], len(blocks)
             if any(block.shape != (n_states, n_states) for block in blocks):
                 raise ValueError(f"each action's matrix must be [S, S], got {[b.shape for b in blocks]}")
             stacked = sparse.vstack(blocks, format="csr")
             rows = stacked[np.arange(n_states * n_actions).reshape(n_actions, n_states).T.ravel()]
         else:
-            rows = sparse.csr_array(transitions)
+            # A copy: merging duplicates works in place, and the caller's matrix is the caller's.
+            rows = sparse.csr_array(transitions, copy=True)
             n_states = rows.shape[1]
-            if rows.shape[0] % n_states:
+            if n_states == 0 or rows.shape[0] % n_states:
                 raise ValueError(f"transitions must have shape [S * A, S], got {rows.shape}")
             n_actions = rows.shape[0] // n_states
-        rows = sparse.csr_array(rows)
         rows.sum_duplicates()
         counts = np.diff(rows.indptr)
         width = max(int(counts.max(initial=0)), 1)
@@ -213,7 +232,10 @@ class TabularMDP:
         probabilities[pair, slot] = rows.data
         shape = (n_states, n_actions, width)
         return TabularMDP.from_successors(
-            successors.reshape(shape), probabilities.reshape(shape), features, **options  # type: ignore[arg-type]
+            successors.reshape(shape),
+            probabilities.reshape(shape),
+            features,
+            **options,
         )
 
     # -- shape and names ------------------------------------------------------------------------------
@@ -315,29 +337,39 @@ def _checked_labels(
     n_actions: int,
     feature_array: np.ndarray,
 ) -> Labels:
-    sizes = {"state": n_states, "action": n_actions, "feature": feature_array.shape[-1] if feature_array.ndim else 0}
-    given = {"state": states, "action": actions, "feature": features}
+    sizes = {
+        "state": n_states,
+        "action": n_actions,
+        "feature": feature_array.shape[-1] if feature_array.ndim else 0,
+    }
+    given = {
+        kind: None if names is None else tuple(str(name) for name in names)
+        for kind, names in (("state", states), ("action", actions), ("feature", features))
+    }
     for kind, names in given.items():
         if names is None:
             continue
         if len(names) != sizes[kind]:
             raise ValueError(f"{len(names)} {kind} names were given for {sizes[kind]} {kind}s")
         if len(set(names)) != len(names):
-            repeated = sorted({n for n in names if list(names).count(n) > 1})[:3]
+            repeated = [name for name, count in Counter(names).items() if count > 1][:3]
             raise ValueError(f"{kind} names must differ; repeated: {', '.join(repeated)}")
-    return Labels(*(None if names is None else tuple(str(n) for n in names) for names in given.values()))
+    return Labels(*given.values())
 
 
 def _check_transitions(
     successors: np.ndarray, probabilities: np.ndarray, available: np.ndarray, n_states: int, name: _PairNames
 ) -> None:
     mask = available[..., None]
-    if not np.isfinite(probabilities[available]).all():
-        s, a, _ = np.argwhere(~np.isfinite(probabilities) & mask)[0]
+    probabilities = np.where(mask, probabilities, 0.0)
+    if not np.isfinite(probabilities).all():
+        s, a, _ = np.argwhere(~np.isfinite(probabilities))[0]
         raise ValueError(f"a transition probability of {name.pair(s, a)} is not a number")
-    if (np.where(mask, probabilities, 0) < 0).any():
-        s, a, b = np.argwhere((probabilities < 0) & mask)[0]
-        raise ValueError(f"a transition probability of {name.pair(s, a)} is negative: {probabilities[s, a, b]}")
+    if (probabilities < 0).any():
+        s, a, b = np.argwhere(probabilities < 0)[0]
+        raise ValueError(
+            f"a transition probability of {name.pair(s, a)} is negative: {probabilities[s, a, b]}"
+        )
     total = probabilities.sum(-1)
     wrong = available & (np.abs(total - 1) > 1e-8)
     if wrong.any():
@@ -345,14 +377,16 @@ def _check_transitions(
         raise ValueError(
             f"transition probabilities must sum to 1; those of {name.pair(s, a)} sum to {total[s, a]}"
         )
-    outside = ((successors < 0) | (successors >= n_states)) & (probabilities > 0) & mask
+    outside = ((successors < 0) | (successors >= n_states)) & (probabilities > 0)
     if outside.any():
         s, a, b = np.argwhere(outside)[0]
-        raise ValueError(f"{name.pair(s, a)} leads to state {successors[s, a, b]}, but states are 0 to {n_states - 1}")
+        raise ValueError(
+            f"{name.pair(s, a)} leads to state {successors[s, a, b]}, but states are 0 to {n_states - 1}"
+        )
 
 
 def _inflow(successors: np.ndarray, probabilities: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    n_states, n_actions, width = successors.shape
+    n_states, _, width = successors.shape
     source = np.flatnonzero(probabilities.ravel() > 0)
     target = successors.ravel()[source]
     order = np.argsort(target, kind="stable")

@@ -1,12 +1,14 @@
 """Planning: what an expert with a given reward would do, and what would come of it.
 
 Soft (maximum causal entropy; Ziebart 2010) and hard planning, over an infinite discounted or a finite
-horizon; values, occupancies and feature expectations of a policy. Everything is differentiable in the
-reward, the transition probabilities and the discount by the implicit function theorem: no unrolling.
+horizon; values, occupancies and feature expectations of a policy. Soft plans and everything computed of a
+policy are differentiable in the reward, the transition probabilities and the discount, over an infinite
+horizon by the implicit function theorem: no unrolling.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -17,10 +19,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from .mdp import TabularMDP
 
-# Up to here a dense [S, S] factorisation beats sweeping (0.1 ms at 124 states, 12 ms at 1024).
+# Up to here a dense [S, S] factorisation beats Krylov iterations (0.1 ms at 124 states, 12 ms at 1024).
 DIRECT_LIMIT = 1500
-_NEWTON_STEPS = 60
-_MAX_SWEEPS = 200_000
+# Policy iteration takes a handful of steps as a rule, but may take one a state on a corridor whose moves
+# cost more than a distant reward is worth at first sight.
+_MAX_STEPS = 20_000
+# Work of one accelerated step: this many backups, or Krylov iterations that must gain more than they would.
+_BACKUPS = 50
+_EPS = float(jnp.finfo(jnp.float64).eps)
 
 
 class SoftPlan(NamedTuple):
@@ -67,7 +73,8 @@ def require_discounted(mdp: TabularMDP) -> None:
     """Raise ``ValueError`` if infinite-horizon planning has no solution because the discount is 1."""
     if not isinstance(mdp.discount, jax.core.Tracer) and float(mdp.discount) >= 1:
         raise ValueError(
-            "discount 1 has no infinite-horizon solution: use a discount below 1, or plan over a finite horizon"
+            "discount 1 has no infinite-horizon solution: use a discount below 1, "
+            "or plan over a finite horizon"
         )
 
 
@@ -76,20 +83,22 @@ def soft_plan(
 ) -> SoftPlan:
     """Solve the soft Bellman equations over an infinite discounted horizon.
 
-    ``start [S]`` warm-starts the values. Newton's method (soft policy iteration) with direct solves up to
-    ``DIRECT_LIMIT`` states, otherwise sweeps with MacQueen's bounds; to about 1e-12 of the values' scale.
-    Raises ``ValueError`` for discount 1.
+    ``start [S]`` warm-starts the values. Newton's method (soft policy iteration), with direct solves up to
+    ``DIRECT_LIMIT`` states and Krylov solves beyond; to about 1e-12 of the values' scale, or as well as
+    rounding allows where the discount is above 0.99. Raises ``ValueError`` for discount 1.
     """
     require_discounted(mdp)
-    if start is None:
-        start = jnp.zeros(mdp.n_states, reward.dtype)
-    values = _soft_values(mdp, reward, lax.stop_gradient(start))
+    start = jnp.zeros(mdp.n_states) if start is None else jnp.asarray(start, float)
+    values = _soft_values(mdp, jnp.asarray(reward), lax.stop_gradient(start))
     q = action_values(mdp, reward, values)
     v = jax.nn.logsumexp(q, axis=1)
     return SoftPlan(v, q, q - v[:, None])
 
 
-def _soft_backup(mdp: TabularMDP, reward: Float[Array, "S A"], values: Float[Array, " S"]) -> Float[Array, " S"]:
+def soft_backup(
+    mdp: TabularMDP, reward: Float[Array, "S A"], values: Float[Array, " S"]
+) -> Float[Array, " S"]:
+    """One sweep of the soft Bellman equations, ``log sum_a exp(r + gamma P values)``."""
     return jax.nn.logsumexp(action_values(mdp, reward, values), axis=1)
 
 
@@ -98,22 +107,8 @@ def _soft_values(
     mdp: TabularMDP, reward: Float[Array, "S A"], start: Float[Array, " S"]
 ) -> Float[Array, " S"]:
     if mdp.n_states > DIRECT_LIMIT:
-        return _sweep(lambda v: _soft_backup(mdp, reward, v), start, mdp.discount)
-
-    def newton(carry: tuple) -> tuple:
-        values, _, step = carry
-        q = action_values(mdp, reward, values)
-        backup = jax.nn.logsumexp(q, axis=1)
-        chain = mdp.state_transitions(jnp.exp(q - backup[:, None]))
-        matrix = jnp.eye(mdp.n_states) - mdp.discount * chain
-        new = values + jnp.linalg.solve(matrix, backup - values)
-        return new, jnp.max(jnp.abs(new - values)), step + 1
-
-    def unfinished(carry: tuple) -> Bool[Array, ""]:
-        values, change, step = carry
-        return (change > 1e-12 * (1 + jnp.max(jnp.abs(values)))) & (step < _NEWTON_STEPS)
-
-    return lax.while_loop(unfinished, newton, (start, jnp.array(jnp.inf), 0))[0]
+        return _fixed_point(lambda v: soft_backup(mdp, reward, v), start, mdp.discount)
+    return _policy_iteration(mdp, reward, start, lambda q: jax.nn.softmax(q, axis=1), jax.nn.logsumexp)
 
 
 @_soft_values.defjvp
@@ -122,26 +117,29 @@ def _soft_values_jvp(primals: tuple, tangents: tuple) -> tuple:
     mdp_dot, reward_dot, _ = tangents
     values = _soft_values(mdp, reward, start)
     policy = jax.nn.softmax(action_values(mdp, reward, values), axis=1)
-    _, residual = jax.jvp(lambda m, r: _soft_backup(m, r, values), (mdp, reward), (mdp_dot, reward_dot))
+    _, residual = jax.jvp(lambda m, r: soft_backup(m, r, values), (mdp, reward), (mdp_dot, reward_dot))
     return values, solve_values(mdp, policy, residual)
 
 
 def hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: float = 1e-9) -> HardPlan:
     """Solve the Bellman optimality equations; actions within ``tolerance`` of the best count as optimal.
 
-    ``tolerance`` is relative to the spread of the values. Policy iteration up to ``DIRECT_LIMIT`` states,
-    otherwise value iteration. Raises ``ValueError`` for discount 1.
+    ``tolerance`` is relative to the spread of the values. Policy iteration, with direct solves up to
+    ``DIRECT_LIMIT`` states and Krylov solves beyond. Raises ``ValueError`` for discount 1.
     """
     require_discounted(mdp)
 
     def backup(values: Float[Array, " S"]) -> Float[Array, " S"]:
         return jnp.max(action_values(mdp, reward, values), axis=1)
 
+    def greedy(q: Float[Array, "S A"]) -> Float[Array, "S A"]:
+        return jax.nn.one_hot(jnp.argmax(q, axis=1), mdp.n_actions)
+
     start = jnp.zeros(mdp.n_states)
     if mdp.n_states > DIRECT_LIMIT:
-        values = _sweep(backup, start, mdp.discount)
+        values = _fixed_point(backup, start, mdp.discount)
     else:
-        values = _policy_iteration(mdp, reward, start)
+        values = _policy_iteration(mdp, reward, start, greedy, jnp.max)
     q = action_values(mdp, reward, values)
     return HardPlan(values, q, greedy_actions(q, tolerance))
 
@@ -158,41 +156,80 @@ def deterministic_policy(optimal: Bool[Array, "S A"]) -> Float[Array, "S A"]:
     return jax.nn.one_hot(jnp.argmax(optimal, axis=1), optimal.shape[1])
 
 
+def _precision(discount: Float[Array, ""]) -> Float[Array, ""]:
+    """Residual, relative to the solution, that places it within 1e-12, or at which rounding takes over."""
+    return jnp.maximum(1e-12 * (1 - discount), 16 * _EPS)
+
+
 def _policy_iteration(
-    mdp: TabularMDP, reward: Float[Array, "S A"], start: Float[Array, " S"]
+    mdp: TabularMDP,
+    reward: Float[Array, "S A"],
+    start: Float[Array, " S"],
+    policy_of: Callable[[Float[Array, "S A"]], Float[Array, "S A"]],
+    best_of: Callable[..., Float[Array, " S"]],
 ) -> Float[Array, " S"]:
-    def improve(carry: tuple) -> tuple:
-        values, _, step = carry
+    def residual(values: Float[Array, " S"]) -> tuple:
         q = action_values(mdp, reward, values)
-        policy = jax.nn.one_hot(jnp.argmax(q, axis=1), mdp.n_actions)
-        matrix = jnp.eye(mdp.n_states) - mdp.discount * mdp.state_transitions(policy)
+        return q, best_of(q, axis=1) - values
+
+    def improve(carry: tuple) -> tuple:
+        values, q, gap, step = carry
+        matrix = jnp.eye(mdp.n_states) - mdp.discount * mdp.state_transitions(policy_of(q))
         # Newton's form (correct the values by the residual) keeps rounding errors from accumulating.
-        new = values + jnp.linalg.solve(matrix, jnp.max(q, axis=1) - values)
-        return new, jnp.max(jnp.abs(new - values)), step + 1
+        values = values + jnp.linalg.solve(matrix, gap)
+        return values, *residual(values), step + 1
 
     def unfinished(carry: tuple) -> Bool[Array, ""]:
-        values, change, step = carry
-        return (change > 1e-12 * (1 + jnp.max(jnp.abs(values)))) & (step < 1000)
+        values, _, gap, step = carry
+        scale = 1 + jnp.max(jnp.abs(values))
+        return (jnp.max(jnp.abs(gap)) > _precision(mdp.discount) * scale) & (step < _MAX_STEPS)
 
-    return lax.while_loop(unfinished, improve, (start, jnp.array(jnp.inf), 0))[0]
+    return lax.while_loop(unfinished, improve, (start, *residual(start), 0))[0]
 
 
-def _sweep(backup: object, start: Float[Array, " S"], discount: Float[Array, ""]) -> Float[Array, " S"]:
-    """Iterate a monotone backup; MacQueen's bounds place the fixed point within the spread of the change."""
+def _largest(x: Float[Array, " S"]) -> Float[Array, ""]:
+    return jnp.max(jnp.abs(x))
 
-    def sweep(carry: tuple) -> tuple:
-        values, _, step = carry
-        new = backup(values)  # type: ignore[operator]
-        change = new - values
-        return new, jnp.stack([jnp.min(change), jnp.max(change)]), step + 1
+
+def _fixed_point(
+    backup: Callable[[Float[Array, " S"]], Float[Array, " S"]],
+    start: Float[Array, " S"],
+    discount: Float[Array, ""],
+    size: Callable[[Float[Array, " S"]], Float[Array, ""]] = _largest,
+    forcing: float = 1e-2,
+) -> Float[Array, " S"]:
+    """Fixed point of a backup that contracts by ``discount`` in the norm ``size``.
+
+    Inexact Newton: each step solves the linearised equation by BiCGSTAB to the relative residual
+    ``forcing``. A step that gains less than ``_BACKUPS`` plain backups would is replaced by them, so that
+    convergence is never slower than successive approximation, whatever the chain.
+    """
+
+    def newton(x: Float[Array, " S"], gap: Float[Array, " S"]) -> Float[Array, " S"]:
+        _, slope = jax.linearize(backup, x)
+        correction, _ = jax.scipy.sparse.linalg.bicgstab(
+            lambda d: d - slope(d), gap, tol=forcing, maxiter=_BACKUPS
+        )
+        return x + correction
+
+    def step(carry: tuple) -> tuple:
+        x, gap, count = carry
+        ahead = newton(x, gap)
+        ahead_gap = backup(ahead) - ahead
+        gains = size(ahead_gap) <= discount**_BACKUPS * size(gap)
+
+        def swept() -> tuple:
+            y = lax.fori_loop(0, _BACKUPS, lambda _, y: backup(y), x)
+            return y, backup(y) - y
+
+        x, gap = lax.cond(gains, lambda: (ahead, ahead_gap), swept)
+        return x, gap, count + 1
 
     def unfinished(carry: tuple) -> Bool[Array, ""]:
-        values, (low, high), step = carry
-        gap = (high - low) * discount / (1 - discount)
-        return (gap > 1e-11 * (1 + jnp.max(jnp.abs(values)))) & (step < _MAX_SWEEPS)
+        x, gap, count = carry
+        return (size(gap) > _precision(discount) * size(x)) & (count < _MAX_STEPS)
 
-    values, bounds, _ = lax.while_loop(unfinished, sweep, (start, jnp.array([-jnp.inf, jnp.inf]), 0))
-    return values + jnp.mean(bounds) * discount / (1 - discount)
+    return lax.while_loop(unfinished, step, (start, backup(start) - start, 0))[0]
 
 
 def solve_values(
@@ -201,35 +238,56 @@ def solve_values(
     """Solve ``x = rate + gamma P_pi x``: discounted sums of a per-state rate under a policy.
 
     ``rate`` may carry trailing dimensions ``[S, K]``. Differentiable, forward and in reverse.
+    Raises ``ValueError`` for discount 1.
     """
-    discount = mdp.discount
+    require_discounted(mdp)
+    fixed, fixed_policy = lax.stop_gradient((mdp, policy))
+
+    def expected(mdp: TabularMDP, policy: Float[Array, "S A"], x: Float[Array, " S"]) -> Float[Array, " S"]:
+        return mdp.discount * jnp.sum(policy * mdp.expect_next(x), axis=1)
+
+    def spread(x: Float[Array, " S"]) -> Float[Array, " S"]:
+        return fixed.discount * fixed.push_forward(x[:, None] * fixed_policy)
 
     def matvec(x: Array) -> Array:
-        return x - discount * jnp.einsum("sa,sab,sab...->s...", policy, mdp.probabilities, x[mdp.successors])
+        return x - _by_column(lambda c: expected(mdp, policy, c), x)
 
     if mdp.n_states > DIRECT_LIMIT:
 
-        def iterate(operator: object, b: Array) -> Array:
-            def step(carry: tuple) -> tuple:
-                x, _, i = carry
-                new = b + x - operator(x)  # type: ignore[operator]
-                return new, jnp.max(jnp.abs(new - x)), i + 1
+        def iterate(_: object, b: Array) -> Array:
+            return _by_column(
+                lambda c: _fixed_point(
+                    lambda x: c + expected(fixed, fixed_policy, x), c, fixed.discount, forcing=1e-8
+                ),
+                b,
+            )
 
-            def unfinished(carry: tuple) -> Bool[Array, ""]:
-                x, change, i = carry
-                return (change * discount > 1e-12 * (1 - discount) * (1e-30 + jnp.max(jnp.abs(x)))) & (i < _MAX_SWEEPS)
+        def iterate_back(_: object, b: Array) -> Array:
+            # Gathering from predecessors, where autodiff's transpose would scatter; and the transposed
+            # chain contracts in the sum of absolute values, not in the largest.
+            return _by_column(
+                lambda c: _fixed_point(
+                    lambda x: c + spread(x), c, fixed.discount, lambda x: jnp.sum(jnp.abs(x)), forcing=1e-8
+                ),
+                b,
+            )
 
-            return lax.while_loop(unfinished, step, (b, jnp.array(jnp.inf), 0))[0]
-
-        return lax.custom_linear_solve(matvec, rate, iterate, iterate)
-    matrix = jnp.eye(mdp.n_states) - discount * mdp.state_transitions(lax.stop_gradient(policy))
-    factors = jax.scipy.linalg.lu_factor(lax.stop_gradient(matrix))
+        return lax.custom_linear_solve(matvec, rate, iterate, iterate_back)
+    factors = jax.scipy.linalg.lu_factor(
+        jnp.eye(mdp.n_states) - fixed.discount * fixed.state_transitions(fixed_policy)
+    )
     return lax.custom_linear_solve(
         matvec,
         rate,
         lambda _, b: jax.scipy.linalg.lu_solve(factors, b),
         lambda _, b: jax.scipy.linalg.lu_solve(factors, b, trans=1),
     )
+
+
+def _by_column(function: Callable[[Float[Array, " S"]], Float[Array, " S"]], x: Array) -> Array:
+    """Apply a function of ``[S]`` along the first dimension of ``[S, ...]``."""
+    columns = x.reshape(x.shape[0], -1)
+    return jax.vmap(function, in_axes=1, out_axes=1)(columns).reshape(x.shape) if x.ndim > 1 else function(x)
 
 
 # -- what a policy is worth, and where it goes --------------------------------------------------------
@@ -251,7 +309,7 @@ def features_to_go(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array,
 def occupancy(
     mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, "S A"]:
-    """Discounted occupancy ``x(s, a) = sum_t gamma^t P(s_t = s, a_t = a)``; it sums to ``1 / (1 - gamma)``."""
+    """Discounted occupancy ``x(s, a) = sum_t gamma^t P(s_t = s, a_t = a)``; sums to ``1 / (1 - gamma)``."""
     initial = mdp.initial if initial is None else initial
     # The transpose of the linear map above; differentiating it gives the transposed solve.
     _, pull = jax.vjp(lambda rate: solve_values(mdp, policy, rate), jnp.zeros(mdp.n_states))
@@ -283,8 +341,8 @@ def finite_soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int)
         v = jax.nn.logsumexp(q, axis=1)
         return v, (v, q - v[:, None])
 
-    _, (values, log_policy) = lax.scan(back, jnp.zeros(mdp.n_states), None, horizon, reverse=True)
-    return FinitePlan(values, log_policy)
+    plan: tuple = lax.scan(back, jnp.zeros(mdp.n_states), None, horizon, reverse=True)[1]
+    return FinitePlan(*plan)
 
 
 def finite_hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int) -> FinitePlan:
@@ -295,8 +353,8 @@ def finite_hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int)
         best = greedy_actions(q)
         return jnp.max(q, axis=1), (jnp.max(q, axis=1), jnp.log(best / best.sum(1, keepdims=True)))
 
-    _, (values, log_policy) = lax.scan(back, jnp.zeros(mdp.n_states), None, horizon, reverse=True)
-    return FinitePlan(values, log_policy)
+    plan: tuple = lax.scan(back, jnp.zeros(mdp.n_states), None, horizon, reverse=True)[1]
+    return FinitePlan(*plan)
 
 
 def finite_occupancy(
@@ -308,8 +366,7 @@ def finite_occupancy(
         pairs = state[:, None] * policy
         return mdp.push_forward(pairs), pairs
 
-    _, pairs = lax.scan(step, mdp.initial if initial is None else initial, policies)
-    return pairs
+    return lax.scan(step, mdp.initial if initial is None else initial, policies)[1]
 
 
 # -- reachability -------------------------------------------------------------------------------------
@@ -335,7 +392,7 @@ def simulate(
     length: int,
     first: Int[Array, ""] | None = None,
 ) -> tuple[Int[Array, " T"], Int[Array, " T"]]:
-    """Draw one trajectory of ``length`` pairs (states, actions) under a policy; starts at ``first`` or ``p0``."""
+    """Draw one trajectory of ``length`` pairs (states, actions) under a policy, from ``first`` or ``p0``."""
     start_key, key = jax.random.split(key)
     state = jax.random.categorical(start_key, jnp.log(mdp.initial)) if first is None else jnp.asarray(first)
 
@@ -346,5 +403,4 @@ def simulate(
         return mdp.successors[state, action, branch], (state, action)
 
     state = state.astype(mdp.successors.dtype)
-    _, (states, actions) = lax.scan(step, state, jax.random.split(key, length))
-    return states, actions
+    return lax.scan(step, state, jax.random.split(key, length))[1]

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro.distributions as dist
 from jaxtyping import Array, Bool, Float, Int
 from numpyro.distributions import constraints
+from numpyro.distributions.util import validate_sample
 
 from .chain import filter_forward
-from .demonstration import HIDDEN, LOST, PAD, SEEN, Demonstration
-from .evidence import Imperfection, observe, step_log_evidence
+from .demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration
+from .evidence import Imperfection, observe, require_fitting, step_log_evidence
 from .mdp import TabularMDP
 from .planning import reward_of, simulate, soft_plan
 
 
-class _Codes(constraints.Constraint):  # type: ignore[misc]
+class _Codes(constraints.Constraint):
     """Codes (kind, state, action) of known kinds, states and actions."""
 
     is_discrete = True
@@ -27,19 +29,22 @@ class _Codes(constraints.Constraint):  # type: ignore[misc]
 
     def __call__(self, x: Int[Array, "... L 3"]) -> Bool[Array, "..."]:
         kind, state, action = x[..., 0], x[..., 1], x[..., 2]
-        inside = (kind >= PAD) & (kind <= LOST) & (state < self.n_states) & (action < self.n_actions)
-        seen = (kind != SEEN) | (state >= 0) | (action >= 0)
-        return jnp.all(inside & seen, axis=-1)
+        inside = (
+            (state >= UNKNOWN) & (state < self.n_states) & (action >= UNKNOWN) & (action < self.n_actions)
+        )
+        seen = (kind != SEEN) | (state != UNKNOWN) | (action != UNKNOWN)
+        ended = jnp.all((kind[..., :-1] != PAD) | (kind[..., 1:] == PAD), axis=-1)
+        return jnp.all((kind >= PAD) & (kind <= LOST) & inside & seen, axis=-1) & ended
 
     def feasible_like(self, prototype: Array) -> Array:
-        return jnp.broadcast_to(jnp.array([HIDDEN, -1, -1], jnp.int32), prototype.shape)
+        return jnp.broadcast_to(jnp.array([HIDDEN, UNKNOWN, UNKNOWN], jnp.int32), prototype.shape)
 
     def tree_flatten(self) -> tuple:
         return (), ((), {"n_states": self.n_states, "n_actions": self.n_actions})
 
 
-class TrajectoryLaw(dist.Distribution):  # type: ignore[misc]
-    """What a sensor perceives of ``length`` steps of an expert who follows the soft policy of ``theta . phi``.
+class TrajectoryLaw(dist.Distribution):
+    """What a sensor perceives of ``length`` steps of an expert who follows ``theta . phi``'s soft policy.
 
     A value is an integer array ``[..., L, 3]`` of (kind, state, action), as in
     :attr:`Demonstration.codes`; trajectories shorter than ``length`` are padded. ``log_prob`` is exact:
@@ -55,6 +60,9 @@ class TrajectoryLaw(dist.Distribution):  # type: ignore[misc]
         What is hidden and what is noisy; ``Sensor()`` sees everything.
     length : int
         Steps of an event, ``L``.
+
+    Raises ``ValueError`` for discount 1, for a sensor made for another MDP, and for values of another
+    length.
     """
 
     arg_constraints = {"weights": constraints.real_vector}  # noqa: RUF012
@@ -70,6 +78,7 @@ class TrajectoryLaw(dist.Distribution):  # type: ignore[misc]
         *,
         validate_args: bool | None = None,
     ) -> None:
+        require_fitting(sensor, mdp)
         self.mdp, self.weights, self.sensor, self.length = mdp, weights, sensor, length
         self.log_policy = soft_plan(mdp, reward_of(mdp, weights)).log_policy
         super().__init__((), (length, 3), validate_args=validate_args)
@@ -93,6 +102,7 @@ class TrajectoryLaw(dist.Distribution):  # type: ignore[misc]
         codes = jax.vmap(one)(jax.random.split(key, size))
         return codes.reshape((*sample_shape, self.length, 3))
 
+    @validate_sample
     def log_prob(self, value: Int[Array, "... L 3"]) -> Float[Array, "..."]:
         """Exact log-probability of what was perceived, hidden steps summed out."""
 
@@ -105,10 +115,13 @@ class TrajectoryLaw(dist.Distribution):  # type: ignore[misc]
             )(kind, state, action)
             return filter_forward(self.mdp, evidence + self.log_policy, kind != PAD).log_likelihood
 
-        flat = jnp.asarray(value).reshape((-1, self.length, 3))
+        value = jnp.asarray(value)
+        if value.shape[-2:] != (self.length, 3):
+            raise ValueError(f"a value has shape [..., {self.length}, 3], got {value.shape}")
+        flat = value.reshape((-1, self.length, 3))
         return jax.vmap(one)(flat).reshape(value.shape[:-2])
 
 
 def sample_demonstration(key: Array, law: TrajectoryLaw, n_trajectories: int) -> Demonstration:
     """Simulate a demonstration of independent trajectories."""
-    return Demonstration.from_codes(law.sample(key, (n_trajectories,)))
+    return Demonstration.from_codes(np.asarray(law.sample(key, (n_trajectories,))))
