@@ -1,0 +1,480 @@
+"""Latent maximum-entropy IRL (chapter 4): learning from partly hidden demonstrations, online and in batch.
+
+A session alternates the E-step (completion under the current policy) and the M-step (a maximum-entropy
+program started at the current weights): Algorithm 1, with its sampling carried out exactly and its
+exponentiated gradient, which can express neither negative weights nor a sharper expert, replaced.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ..models.chain import Smoothed
+from ..models.demonstration import SEEN as SEEN_STEP
+from ..models.demonstration import Demonstration, DemonstrationError
+from ..models.evidence import Imperfection, Sensor, require_possible
+from ..models.mdp import TabularMDP
+from ..models.planning import SoftPlan, require_discounted, reward_of, soft_plan
+from .maxent import Solution, WarmStart, exponentiated_gradient, fit_counts, solve_dual
+from .maxent_constraints import FeatureTarget
+from .session import Learner, Report
+from .smoothing import Evidence, blocked_posterior, evidence_of, gibbs_posterior, smooth_all
+from .statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
+
+# Nats per trajectory and unit of weight. Smaller lets nearly deterministic experts be nearly deterministic.
+DEFAULT_SLACK = 0.002
+# Lemma 2 with eps_s = 0.05 and delta_s = 0.1 for six features (section 7.4.1).
+DEFAULT_DRAWS = 957
+
+
+class LMEState(NamedTuple):
+    """What LME-I2RL carries from session to session (Definition 7).
+
+    Fields
+    ------
+    weights : float ``[K]``
+        The reward estimate ``theta^i``.
+    statistic : FeatureStatistic or CountStatistic
+        The sufficient statistic, a running average over all trajectories so far.
+    values : float ``[S]``
+        Soft values of ``weights``: planning's warm start.
+    program : tuple
+        The solver's own warm start, empty for solvers that start from weights and values.
+    session : int
+        Sessions so far.
+    key : random key
+    """
+
+    weights: Float[Array, " K"]
+    statistic: Any
+    values: Float[Array, " S"]
+    program: Any
+    session: Int[Array, ""]
+    key: Array
+
+
+class _Iterate(NamedTuple):
+    """One point of the EM iteration."""
+
+    weights: Float[Array, " K"]
+    values: Float[Array, " S"]
+    change: Float[Array, ""]
+    residual: Float[Array, ""]
+    iterations: Int[Array, ""]
+    solver_iterations: Int[Array, ""]
+    key: Array
+
+
+class _Method(NamedTuple):
+    """What the parts of a session need to know."""
+
+    mdp: TabularMDP
+    sensor: Imperfection
+    statistic: Statistic
+    completion: Callable[[Array, TabularMDP, Float[Array, "S A"], Evidence], Smoothed]
+    slack: float
+    ridge: float
+
+    def plan(self, weights: Float[Array, " K"], values: Float[Array, " S"]) -> SoftPlan:
+        return soft_plan(self.mdp, reward_of(self.mdp, weights), values)
+
+    def e_step(self, key: Array, plan: SoftPlan, evidence: Evidence, seen: Bool[Array, "n L"]) -> Any:
+        posterior = self.completion(key, self.mdp, plan.log_policy, evidence)
+        return complete(self.mdp, posterior, evidence.live, seen)
+
+    def working(self, kept: Any, key: Array, plan: SoftPlan, evidence: Evidence, seen: Array) -> Any:
+        """What the M-step fits: the carried statistic and the current session, completed under ``plan``."""
+        completed = self.e_step(key, plan, evidence, seen)
+        return blend(kept, self.statistic.of_session(self.mdp, plan, completed))
+
+    def penalties(self, statistic: Any) -> tuple:
+        """Slack of the program, and the prior's precision per trajectory."""
+        return self.statistic.slack(self.mdp, self.slack), self.ridge / jnp.maximum(statistic.size, 1.0)
+
+
+def lme_i2rl(
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    *,
+    statistic: str = "seen",
+    completion: str = "exact",
+    solver: str = "newton",
+    slack: float = DEFAULT_SLACK,
+    ridge: float = 0.0,
+    draws: int = DEFAULT_DRAWS,
+    iterations: int = 10,
+    tolerance: float = 1e-3,
+    name: str = "LME-I2RL",
+) -> Learner:
+    """Online latent maximum-entropy IRL (Algorithm 1).
+
+    Parameters
+    ----------
+    mdp : TabularMDP
+        The expert's process without its reward; discount below 1.
+    sensor : Imperfection
+        What the learner cannot see and what it may misread.
+    statistic : {"seen", "counts", "features"}
+        What is kept of a session; see :mod:`i2rl.inference.statistic`.
+    completion : {"exact", "blocked", "gibbs"}
+        The E-step: exact, or estimated from ``draws`` samples.
+    solver : {"newton", "ipopt", "cvxpy", "exponentiated gradient"}
+        The M-step: proximal Newton in JAX; the CasADi program with IPOPT, warm-started from the last
+        session; the CVXPY primal; the normalised exponentiated gradient as printed. The last two solve the
+        program of the ``features`` statistic only.
+    slack : float
+        Relaxation ``epsilon`` of the matching constraint: an L1 penalty of ``slack`` nats per trajectory
+        (``slack / (1 - gamma)`` with the ``features`` statistic, as in Theorem 1).
+    ridge : float
+        Precision of a Gaussian prior on the weights (nats in all, not per trajectory).
+    iterations, tolerance : int, float
+        A session ends after so many E- and M-steps, or when no weight moves by more than ``tolerance``
+        relative to the largest.
+
+    Returns
+    -------
+    Learner
+        Its ``update`` raises :class:`DemonstrationError` naming trajectory and step for an observation the
+        model rules out; the state it was given stays valid.
+
+    Raises
+    ------
+    ValueError
+        For discount 1 or an unknown option.
+    """
+    require_discounted(mdp)
+    method = _method(mdp, sensor, statistic, completion, slack, ridge, draws)
+    configuration = {
+        "statistic": statistic, "completion": completion, "solver": solver, "slack": slack, "ridge": ridge,
+        "draws": draws if completion != "exact" else 0, "iterations": iterations, "tolerance": tolerance,
+        "sensor": _digest(sensor),
+    }  # fmt: skip
+    start = partial(_carried_on, method)
+    return _learner(name, method, start, solver, iterations, tolerance, configuration)
+
+
+def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Learner:
+    """LME-I2RL that forgets its weights: every session starts from fresh random ones (section 7.3).
+
+    A control for what passing the weights on is worth. Options as for :func:`lme_i2rl`.
+    """
+    carried = lme_i2rl(mdp, sensor, name="LME-I2RL with random weights", **options)
+    configuration = carried.configuration
+    method = _method(
+        mdp, sensor, configuration["statistic"], configuration["completion"], configuration["slack"],
+        configuration["ridge"], configuration["draws"],
+    )  # fmt: skip
+    start = partial(_started_afresh, method)
+    return _learner(
+        carried.name, method, start, configuration["solver"], configuration["iterations"],
+        configuration["tolerance"], configuration,
+    )  # fmt: skip
+
+
+def me_i2rl(mdp: TabularMDP, **options: Any) -> Learner:
+    """Online maximum-entropy IRL under full observability (Theorem 1); options as for :func:`lme_i2rl`."""
+    return lme_i2rl(mdp, Sensor(), name="ME-I2RL", **options)
+
+
+# -- building blocks ----------------------------------------------------------------------------------
+
+
+def _method(
+    mdp: TabularMDP, sensor: Imperfection, statistic: str, completion: str, slack: float, ridge: float, draws: int
+) -> _Method:
+    samplers = {"blocked": blocked_posterior, "gibbs": gibbs_posterior}
+    if statistic not in STATISTICS:
+        raise ValueError(f"statistic must be one of {', '.join(STATISTICS)}, got {statistic!r}")
+    if completion != "exact" and completion not in samplers:
+        raise ValueError(f"completion must be exact, blocked or gibbs, got {completion!r}")
+    if not slack >= 0 or not ridge >= 0:
+        raise ValueError(f"slack and ridge must not be negative, got {slack} and {ridge}")
+
+    def exact(key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Smoothed:
+        del key
+        return smooth_all(mdp, log_policy, evidence)
+
+    complete_with = exact if completion == "exact" else partial(samplers[completion], draws=draws)
+    return _Method(mdp, sensor, STATISTICS[statistic], complete_with, slack, ridge)
+
+
+def _digest(sensor: Imperfection) -> str:
+    """Identifies a sensor in a configuration."""
+    import hashlib
+
+    digest = hashlib.sha256(type(sensor).__name__.encode())
+    for leaf in jax.tree.leaves(sensor):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _random_weights(key: Array, mdp: TabularMDP) -> Float[Array, " K"]:
+    """``theta^0_k ~ uniform(0, 1)`` (Algorithm 1, line 2)."""
+    return jax.random.uniform(key, (mdp.n_features,), float)
+
+
+def _carried_on(method: _Method, key: Array, state: LMEState) -> tuple:
+    del key
+    return state.weights, state.values
+
+
+def _started_afresh(method: _Method, key: Array, state: LMEState) -> tuple:
+    return _random_weights(key, method.mdp), jnp.zeros_like(state.values)
+
+
+def _newton(mdp: TabularMDP, statistic: Any, slack: Array, ridge: Array, start: WarmStart) -> Solution:
+    if isinstance(statistic, FeatureStatistic):
+        return solve_dual(mdp, FeatureTarget(statistic.features, statistic.start), slack, ridge, start)
+    return fit_counts(mdp, statistic.counts, slack, ridge, start)
+
+
+def _exponentiated(mdp: TabularMDP, statistic: Any, slack: Array, ridge: Array, start: WarmStart) -> Solution:
+    del ridge  # the printed update has no prior
+    target = FeatureTarget(statistic.features, statistic.start)
+    return exponentiated_gradient(mdp, target, slack * (1 - mdp.discount), start=start.weights)
+
+
+def _em(
+    method: _Method,
+    m_step: Callable[..., Solution],
+    iterations: int,
+    tolerance: float,
+    kept: Any,
+    evidence: Evidence,
+    seen: Bool[Array, "n L"],
+    key: Array,
+    weights: Float[Array, " K"],
+    values: Float[Array, " S"],
+) -> _Iterate:
+    """E- and M-steps in one compiled loop."""
+
+    def step(point: _Iterate) -> _Iterate:
+        key, sample = jax.random.split(point.key)
+        plan = method.plan(point.weights, point.values)
+        working = method.working(kept, sample, plan, evidence, seen)
+        solution = m_step(
+            method.mdp, working, *method.penalties(working), WarmStart(point.weights, plan.values)
+        )
+        return _Iterate(
+            solution.weights, solution.values, _change(point.weights, solution.weights), solution.residual,
+            point.iterations + 1, point.solver_iterations + solution.iterations, key,
+        )  # fmt: skip
+
+    def unfinished(point: _Iterate) -> Bool[Array, ""]:
+        return (point.change > tolerance) & (point.iterations < iterations)
+
+    zero = jnp.zeros((), int)
+    first = _Iterate(weights, values, jnp.array(jnp.inf), jnp.array(jnp.inf), zero, zero, key)
+    return lax.while_loop(unfinished, step, first)
+
+
+def _change(old: Float[Array, " K"], new: Float[Array, " K"]) -> Float[Array, ""]:
+    return jnp.max(jnp.abs(new - old)) / (1e-3 + jnp.max(jnp.abs(new)))
+
+
+def _close(
+    method: _Method,
+    state: LMEState,
+    point: _Iterate,
+    program: Any,
+    evidence: Evidence,
+    seen: Bool[Array, "n L"],
+) -> tuple[LMEState, Report]:
+    """End a session: complete its demonstration once more, under its own result, and keep the statistic."""
+    mdp, statistic = method.mdp, method.statistic
+    key, sample = jax.random.split(point.key)
+    plan = method.plan(point.weights, point.values)
+    completed = method.e_step(sample, plan, evidence, seen)
+    new = statistic.to_keep(mdp, plan, completed)
+    own = jnp.sum(completed.expectations.log_likelihood)
+    carried = statistic.log_likelihood(mdp, point.weights, plan.values, state.statistic)
+    size = state.statistic.size + new.size
+    report = Report(
+        session=state.session + 1,
+        log_likelihood=(own + carried * state.statistic.size) / jnp.maximum(size, 1.0),
+        demonstration_log_likelihood=own,
+        residual=point.residual,
+        iterations=point.iterations,
+        solver_iterations=point.solver_iterations,
+        seconds=jnp.array(jnp.nan),
+        weights=point.weights,
+    )  # fmt: skip
+    kept = blend(state.statistic, new)
+    return LMEState(point.weights, kept, plan.values, program, state.session + 1, key), report
+
+
+def _learner(
+    name: str,
+    method: _Method,
+    start: Callable[[_Method, Array, LMEState], tuple],
+    solver: str,
+    iterations: int,
+    tolerance: float,
+    configuration: dict[str, Any],
+) -> Learner:
+    mdp = method.mdp
+    in_jax = {"newton": _newton, "exponentiated gradient": _exponentiated}
+    if solver not in (*in_jax, "ipopt", "cvxpy"):
+        raise ValueError(f"solver must be newton, ipopt, cvxpy or exponentiated gradient, got {solver!r}")
+    if solver in ("cvxpy", "exponentiated gradient") and method.statistic.name != "features":
+        raise ValueError(f"the {solver} solver needs the features statistic, not {method.statistic.name}")
+
+    def begin(state: LMEState, demonstration: Demonstration) -> tuple:
+        evidence = evidence_of(mdp, method.sensor, demonstration)
+        seen = jnp.asarray(demonstration.kind) == SEEN_STEP
+        key, fresh = jax.random.split(state.key)
+        return evidence, seen, key, *start(fresh, state)
+
+    program_session = None
+    if solver in in_jax:
+
+        def session(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
+            evidence, seen, key, weights, values = begin(state, demonstration)
+            point = _em(
+                method, in_jax[solver], iterations, tolerance, state.statistic, evidence, seen, key, weights, values
+            )
+            return _close(method, state, point, state.program, evidence, seen)
+
+        run = jax.jit(session)
+        empty_program: Any = ()
+    else:
+        from .programs import host_solver
+
+        solve, empty_program = host_solver(mdp, solver, method.statistic.name)
+        opening = jax.jit(begin)
+        closing = jax.jit(partial(_close, method))
+
+        @jax.jit
+        def expectation(kept: Any, key: Array, weights: Array, values: Array, evidence: Evidence, seen: Array) -> tuple:
+            key, sample = jax.random.split(key)
+            plan = method.plan(weights, values)
+            working = method.working(kept, sample, plan, evidence, seen)
+            return key, plan.values, working, *method.penalties(working)
+
+        def program_session(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
+            evidence, seen, key, weights, values = opening(state, demonstration)
+            program, total, residual, done = state.program, 0, np.inf, 0
+            for done in range(1, iterations + 1):
+                key, values, working, slack, ridge = expectation(
+                    state.statistic, key, weights, values, evidence, seen
+                )
+                solution, program = solve(working, slack, ridge, program)
+                change = float(_change(weights, jnp.asarray(solution.weights)))
+                weights, values = jnp.asarray(solution.weights), jnp.asarray(solution.values)
+                total, residual = total + int(solution.iterations), 0.0
+                if change <= tolerance:
+                    break
+            point = _Iterate(
+                weights, values, jnp.array(change), jnp.array(residual), jnp.array(done), jnp.array(total), key
+            )
+            return closing(state, point, program, evidence, seen)
+
+        run = program_session
+
+    def init(key: Array) -> LMEState:
+        key, fresh = jax.random.split(key)
+        weights = _random_weights(fresh, mdp)
+        return LMEState(
+            weights, method.statistic.empty(mdp), jnp.zeros(mdp.n_states), empty_program, jnp.zeros((), int), key
+        )
+
+    def update(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
+        began = time.perf_counter()
+        new, report = run(state, demonstration.bucketed())
+        if not np.isfinite(report.demonstration_log_likelihood):
+            require_possible(method.sensor, mdp, demonstration)
+            raise DemonstrationError("a trajectory has probability zero under the current policy")
+        numbers = [np.asarray(x).item() for x in report[:-2]]
+        return new, Report(*numbers, time.perf_counter() - began, np.asarray(report.weights))
+
+    return Learner(name, mdp, configuration, init, update, session if solver in in_jax else None)
+
+
+# -- batch --------------------------------------------------------------------------------------------
+
+
+class BatchFit(NamedTuple):
+    """Result of batch LME.
+
+    Fields
+    ------
+    weights : float ``[K]``
+        Of the best restart.
+    log_likelihood : float
+        Exact log-likelihood of the demonstration, nats per trajectory.
+    objective : float ``[restarts]``
+        Penalised log-likelihood (per trajectory) reached from each start.
+    iterations : int ``[restarts]``
+        E- and M-steps of each.
+    """
+
+    weights: Float[np.ndarray, " K"]
+    log_likelihood: float
+    objective: Float[np.ndarray, " restarts"]
+    iterations: Int[np.ndarray, " restarts"]
+
+
+class Batch(NamedTuple):
+    """Batch LME on one decision process; ``fit(key, demonstration)`` uses all trajectories at once."""
+
+    name: str
+    fit: Callable[[Array, Demonstration], BatchFit]
+
+
+def batch_lme(
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    *,
+    restarts: int = 3,
+    slack: float = DEFAULT_SLACK,
+    ridge: float = 0.0,
+    iterations: int = 500,
+    tolerance: float = 1e-3,
+) -> Batch:
+    """Batch latent maximum-entropy IRL: EM over all trajectories from several random starts, best one kept.
+
+    Parameters as for :func:`lme_i2rl`. ``fit`` raises :class:`DemonstrationError` for an observation the
+    model rules out.
+    """
+    require_discounted(mdp)
+    method = _method(mdp, sensor, "counts", "exact", slack, ridge, 0)
+
+    @jax.jit
+    def fit(key: Array, demonstration: Demonstration) -> tuple:
+        evidence = evidence_of(mdp, sensor, demonstration)
+        seen = jnp.asarray(demonstration.kind) == SEEN_STEP
+        kept = method.statistic.empty(mdp)
+
+        def from_start(key: Array) -> tuple:
+            weights = _random_weights(key, mdp)
+            point = _em(
+                method, _newton, iterations, tolerance, kept, evidence, seen, key, weights, jnp.zeros(mdp.n_states)
+            )
+            plan = method.plan(point.weights, point.values)
+            expectations = method.e_step(key, plan, evidence, seen).expectations
+            size = jnp.maximum(expectations.size, 1.0)
+            average = jnp.sum(expectations.log_likelihood) / size
+            penalty = slack * jnp.sum(jnp.abs(point.weights)) + ridge / size / 2 * jnp.sum(point.weights**2)
+            return point.weights, average, average - penalty, point.iterations
+
+        # One start after another: memory stays that of one, and no start waits for the slowest.
+        return lax.map(from_start, jax.random.split(key, restarts))
+
+    def checked(key: Array, demonstration: Demonstration) -> BatchFit:
+        weights, average, objective, steps = (np.asarray(x) for x in fit(key, demonstration.bucketed()))
+        if not np.isfinite(objective).any():
+            require_possible(sensor, mdp, demonstration)
+            raise DemonstrationError("a trajectory has probability zero under every start")
+        best = int(np.nanargmax(objective))
+        return BatchFit(weights[best], float(average[best]), objective, steps)
+
+    return Batch("batch LME", checked)

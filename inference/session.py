@@ -1,0 +1,229 @@
+"""The I2RL framework (chapter 3): learners, sessions, stopping criteria and regret.
+
+A learner is a pair of functions on an explicit state. ``init(key)`` gives the state before the first
+session; ``update(state, demonstration)`` runs one session (Definition 4) and returns the new state and a
+report. The state holds what Definition 7 allows, the reward estimate and the sufficient statistic (with
+warm starts for the solvers), and nothing of earlier demonstrations.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from ..models.demonstration import Demonstration
+from ..models.mdp import TabularMDP
+from ..models.planning import deterministic_policy, hard_plan, policy_values, reward_of
+
+if TYPE_CHECKING:
+    from .journal import Journal
+
+
+class Report(NamedTuple):
+    """What a session did.
+
+    Fields
+    ------
+    session : int
+        Its number, from 1.
+    log_likelihood : float
+        ``LL(theta^i | X_i, statistic)`` in nats per trajectory: the session's demonstration and what the
+        statistic carries, under the new weights.
+    demonstration_log_likelihood : float
+        Exact log-likelihood (nats, hidden steps summed out) of this session's demonstration alone.
+    residual : float
+        Violation of the last program's optimality conditions, in units of the features.
+    iterations : int
+        E- and M-steps.
+    solver_iterations : int
+        Iterations of the programs' solver, summed over the M-steps.
+    seconds : float
+        Wall-clock time of the session.
+    weights : float ``[K]``
+        The new reward weights.
+    """
+
+    session: int
+    log_likelihood: float
+    demonstration_log_likelihood: float
+    residual: float
+    iterations: int
+    solver_iterations: int
+    seconds: float
+    weights: Float[np.ndarray, " K"]
+
+
+class Learner(NamedTuple):
+    """An online learner: configuration, and two functions on an explicit state.
+
+    ``session`` is the pure, compiled core of ``update`` (state and padded demonstration in, state and
+    report out) that :func:`fleet` maps over many streams; None where a solver runs outside JAX.
+    """
+
+    name: str
+    mdp: TabularMDP
+    configuration: Mapping[str, Any]
+    init: Callable[[Array], Any]
+    update: Callable[[Any, Demonstration], tuple[Any, Report]]
+    session: Callable[[Any, Demonstration], tuple[Any, Report]] | None = None
+
+    @property
+    def signature(self) -> str:
+        """Digest of the MDP, the method and its configuration: what a journal must have been made for."""
+        content = json.dumps(
+            [self.mdp.fingerprint(), self.name, dict(self.configuration)], sort_keys=True, default=str
+        )
+        return hashlib.sha256(content.encode()).hexdigest()
+
+
+class Fleet(NamedTuple):
+    """One learner on many independent streams: states and demonstrations with a leading axis."""
+
+    init: Callable[[Array, int], Any]
+    update: Callable[[Any, Demonstration], tuple[Any, Report]]
+
+
+def fleet(learner: Learner) -> Fleet:
+    """Map a learner over independent streams in one compiled program.
+
+    ``init(key, streams)`` and ``update(states, demonstrations)``, the arrays of a demonstration being
+    ``[streams, n, L]``. Raises ``ValueError`` for a learner whose solver runs outside JAX. Observations
+    are not checked: an impossible one shows as a log-likelihood of minus infinity.
+    """
+    if learner.session is None:
+        raise ValueError(f"{learner.name} solves its programs outside JAX, so it cannot be mapped over streams")
+    update = jax.jit(jax.vmap(learner.session))
+    init = jax.vmap(learner.init)
+    return Fleet(lambda key, streams: init(jax.random.split(key, streams)), update)
+
+
+# -- stopping -----------------------------------------------------------------------------------------
+
+
+class StoppingCriterion(Protocol):
+    """Decides from the reports so far whether the sessions should end."""
+
+    def __call__(self, reports: Sequence[Report]) -> bool:
+        """Whether to stop after the last report."""
+
+
+class LikelihoodChange(NamedTuple):
+    """Criterion 1 (Definition 5): the session's log-likelihood changed by at most ``rho``."""
+
+    rho: float
+
+    def __call__(self, reports: Sequence[Report]) -> bool:
+        """Whether to stop after the last report."""
+        if len(reports) < 2:
+            return False
+        return abs(reports[-1].log_likelihood - reports[-2].log_likelihood) <= self.rho
+
+
+class LearningErrorChange:
+    """Criterion 2 (Definition 6): the inverse learning error fell by at most ``rho``.
+
+    For evaluation, where the expert's reward ``weights [K]`` are known; takes them and the MDP.
+    """
+
+    def __init__(self, rho: float, mdp: TabularMDP, weights: Float[np.ndarray, " K"]) -> None:
+        self.rho = rho
+        reward = reward_of(mdp, jnp.asarray(weights))
+        best = hard_plan(mdp, reward).values
+
+        def error(learned: Float[Array, " K"]) -> Float[Array, ""]:
+            policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, learned)).optimal)
+            return jnp.sum(jnp.abs(best - policy_values(mdp, policy, reward)))
+
+        self._error = jax.jit(error)
+
+    def __call__(self, reports: Sequence[Report]) -> bool:
+        """Whether to stop after the last report."""
+        if len(reports) < 2:
+            return False
+        before, after = (float(self._error(jnp.asarray(r.weights))) for r in reports[-2:])
+        return before - after <= self.rho
+
+
+class MovingWindow(NamedTuple):
+    """Against early stopping (chapter 4): the standard deviation over the last ``width`` sessions is small.
+
+    ``of`` names a field of the report: ``log_likelihood`` or ``residual`` (the gradient's norm).
+    """
+
+    width: int
+    tolerance: float
+    of: str = "log_likelihood"
+
+    def __call__(self, reports: Sequence[Report]) -> bool:
+        """Whether to stop after the last report."""
+        if len(reports) < self.width:
+            return False
+        return float(np.std([getattr(r, self.of) for r in reports[-self.width :]])) <= self.tolerance
+
+
+# -- running ------------------------------------------------------------------------------------------
+
+
+class Run(NamedTuple):
+    """Final state, the sessions' reports, and whether a criterion stopped them."""
+
+    state: Any
+    reports: tuple[Report, ...]
+    stopped: bool
+
+
+def run_sessions(
+    learner: Learner,
+    stream: Iterable[Demonstration],
+    *,
+    key: Array | None = None,
+    state: Any = None,
+    stop: StoppingCriterion | None = None,
+    journal: Journal | None = None,
+    on_session: Callable[[Any, Report], None] | None = None,
+) -> Run:
+    """Run one session per demonstration of the stream until it ends or ``stop`` says so (Definition 7).
+
+    Starts from ``state``, or where ``journal`` left off, or from ``learner.init(key)``. With a journal every
+    session is committed before the next one begins; the stream must then hold only what is not yet in it.
+    ``on_session`` is called after each session. Raises ``ValueError`` if neither key, state nor a
+    journal with sessions is given, and whatever ``update`` raises (the state before it stays valid).
+    """
+    if state is None and journal is not None:
+        state = journal.state
+    if state is None:
+        if key is None:
+            raise ValueError("run_sessions needs a key, a state or a journal to start from")
+        state = learner.init(key)
+    reports: list[Report] = []
+    for demonstration in stream:
+        state, report = learner.update(state, demonstration)
+        reports.append(report)
+        if journal is not None:
+            journal.commit(state, report)
+        if on_session is not None:
+            on_session(state, report)
+        if stop is not None and stop(reports):
+            return Run(state, tuple(reports), True)
+    return Run(state, tuple(reports), False)
+
+
+def average_regret(
+    expert: Float[np.ndarray, " T"], learned: Float[np.ndarray, " T"]
+) -> Float[np.ndarray, " T"]:
+    """Average regret after each session (Definition 8): running mean of the log-likelihood given away.
+
+    ``expert`` and ``learned`` are the sessions' log-likelihoods under the true weights and under the
+    learner's, ``LL(theta_E | X_i, .) - LL(theta^i | X_i, .)``. Raises ``ValueError`` if lengths differ.
+    """
+    expert, learned = np.asarray(expert, float), np.asarray(learned, float)
+    if expert.shape != learned.shape or expert.ndim != 1:
+        raise ValueError(f"log-likelihoods must be two lists of one length, got {expert.shape} and {learned.shape}")
+    return np.cumsum(expert - learned) / np.arange(1, len(expert) + 1)
