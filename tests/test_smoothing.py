@@ -30,6 +30,7 @@ N, LENGTH, S, A = 6, 5, 4, 3
 evidence_of = jax.jit(smoothing.evidence_of)
 exact = jax.jit(expectations)
 marginals = jax.jit(smooth_all)
+gibbs = jax.jit(gibbs_completions, static_argnums=(4, 5))
 
 
 def confusion(seed: int) -> ObservationModel:
@@ -197,9 +198,7 @@ def test_gibbs_estimates_lie_within_four_standard_errors_where_every_move_is_pos
     truth = exact(mdp, log_policy, evidence)
     key = jax.random.key(2)
     estimate = jax.jit(gibbs_expectations, static_argnums=(4, 5))(key, mdp, log_policy, evidence, draws, 200)
-    states, actions = jax.jit(gibbs_completions, static_argnums=(4, 5))(
-        key, mdp, log_policy, evidence, draws, 200
-    )
+    states, actions = gibbs(key, mdp, log_policy, evidence, draws, 200)
     live = np.asarray(evidence.live)
     assert (np.asarray(states)[:, ~live] == UNKNOWN).all()
     collected = np.einsum(
@@ -227,7 +226,7 @@ def test_gibbs_never_leaves_what_the_policy_may_do(random_mdp):
     mdp = random_mdp(8, n_successors=S)
     log_policy = jnp.log(jax.nn.one_hot(jnp.array([0, 2, 1, 0]), A))
     evidence = evidence_of(mdp, Sensor(), Demonstration.from_steps([[None] * LENGTH] * 3, mdp))
-    states, actions = gibbs_completions(jax.random.key(0), mdp, log_policy, evidence, 50, 0)
+    states, actions = gibbs(jax.random.key(0), mdp, log_policy, evidence, 50, 0)
     assert (np.asarray(log_policy)[np.asarray(states), np.asarray(actions)] == 0).all()
     np.testing.assert_allclose(exact(mdp, log_policy, evidence).log_likelihood, 0, atol=1e-12)
 
