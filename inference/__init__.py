@@ -1,0 +1,70 @@
+"""How beliefs change: completion, convex programs, samplers, and the online learners.
+
+Names are imported when they are first used: the solvers behind some of them take seconds to load.
+"""
+
+import importlib
+from typing import Any
+
+_HOMES = {
+    "journal": ("Journal", "JournalBusy", "JournalError", "JournalView", "Position", "SessionRecord"),
+    "lme": (
+        "Batch",
+        "BatchFit",
+        "LMEState",
+        "batch_lme",
+        "lme_i2rl",
+        "lme_i2rl_with_random_weights",
+        "me_i2rl",
+    ),
+    "maxent": ("Solution", "WarmStart", "exponentiated_gradient", "fit_counts", "solve_dual"),
+    "maxent_constraints": ("FeatureTarget", "InfeasibleProgram", "ProgramNotSolved"),
+    "maxent_dual": ("CountProgram", "DualProgram"),
+    "maxent_primal": ("PrimalProgram",),
+    "mce": (
+        "CausalEntropyFit",
+        "UnmatchedError",
+        "expected_features",
+        "expected_visits",
+        "feature_dual",
+        "fit_state_rewards",
+        "fit_weights",
+    ),
+    "session": (
+        "Fleet",
+        "Learner",
+        "LearningErrorChange",
+        "LikelihoodChange",
+        "MovingWindow",
+        "Report",
+        "Run",
+        "StoppingCriterion",
+        "average_regret",
+        "fleet",
+        "run_sessions",
+    ),
+    "smoothing": (
+        "Evidence",
+        "Expectations",
+        "blocked_expectations",
+        "evidence_of",
+        "expectations",
+        "gibbs_expectations",
+        "log_likelihoods",
+        "sample_completions",
+        "smooth_all",
+    ),
+    "statistic": ("CountStatistic", "FeatureStatistic"),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+__all__ = sorted(_HOME_OF)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_HOME_OF[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

@@ -233,17 +233,20 @@ class Record(NamedTuple):
     demonstration: Demonstration
 
 
-def read_trajectories(lines: Iterable[str], mdp: TabularMDP, source: str = "input") -> Iterator[Record]:
+def read_trajectories(
+    lines: Iterable[str], mdp: TabularMDP, source: str = "input", first_line: int = 1
+) -> Iterator[Record]:
     """Read trajectories from JSON Lines, one at a time.
 
     A line is an object with ``steps`` and optionally ``id`` (string) and ``agent`` (which of several
     experts, an integer), or just the list of steps. A step is ``{"s": state, "a": action, "score": c}``
     (each by name or index; ``s`` or ``a`` may be missing if it was not perceived; ``score`` in [0, 1] is
-    optional), ``"hidden"`` (looked, saw nothing) or ``null`` (a lost frame). Blank lines are skipped.
+    optional), ``"hidden"`` (looked, saw nothing) or ``null`` (a lost frame). Blank lines are skipped;
+    ``first_line`` is the number of the first one, for a reader that starts midway.
     Raises :class:`DemonstrationError` naming ``source``, line and step.
     """
     names = _Names(mdp)
-    for number, line in enumerate(lines, start=1):
+    for number, line in enumerate(lines, start=first_line):
         if not line.strip():
             continue
         where = f"{source}, line {number}"

@@ -1,0 +1,339 @@
+"""The command line: ``i2rl run``, ``simulate``, ``learn`` and ``show``.
+
+Heavy modules are imported inside the commands, so that ``--help`` answers at once.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from ..models.evidence import Imperfection
+    from ..models.mdp import TabularMDP
+
+app = typer.Typer(
+    help="Learn why somebody acts as they do, while they are still acting, from imperfect observations.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+run = typer.Typer(help="Do a whole study: learn, evaluate, and write a report with pictures.", no_args_is_help=True)
+simulate = typer.Typer(help="Write simulated demonstrations as JSON Lines.", no_args_is_help=True)
+app.add_typer(run, name="run")
+app.add_typer(simulate, name="simulate")
+
+
+class Method(StrEnum):
+    """Learners that ``run patrol`` can compare."""
+
+    online = "lme-i2rl"
+    batch = "batch"
+    random = "random"
+    all = "all"
+
+
+Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of tables.")]
+Instance = Annotated[int, typer.Option(min=1, max=3, help="Patrol instance (1, 2 or 3).")]
+Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same result.")]
+
+
+@app.callback()
+def _version(
+    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)] = False,
+) -> None:
+    if version:
+        from ..version import __version__
+
+        print(__version__)
+        raise typer.Exit
+
+
+# -- run ----------------------------------------------------------------------------------------------
+
+
+@run.command("patrol")
+def run_patrol(
+    instance: Instance = 2,
+    observability: Annotated[
+        int | None, typer.Option(help="Percent of the patrol in view; by default the dissertation's (30, 30, 18).")
+    ] = None,
+    sessions: Annotated[int, typer.Option(min=1, help="Sessions of five steps a patroller.")] = 60,
+    method: Annotated[Method, typer.Option(help="Which learners to run.")] = Method.all,
+    trials: Annotated[int, typer.Option(min=1, help="Simulated breaches per learned policy.")] = 200,
+    runs: Annotated[int, typer.Option(min=1, help="Independent repetitions.")] = 3,
+    seed: Seed = 0,
+    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report"),
+    as_json: Json = False,
+) -> None:
+    """Watch patrollers through a keyhole, learn their reward session by session, and walk past them unseen."""
+    from . import patrol_study
+
+    with _reported_errors(), _progress(as_json) as advance:
+        study = patrol_study.study(
+            instance, observability, sessions=sessions, trials=trials, runs=runs, seed=seed,
+            methods=None if method is Method.all else (method.value,), advance=advance,
+        )  # fmt: skip
+        patrol_study.write(study, report)
+    if as_json:
+        print(json.dumps(patrol_study.summary(study)))
+    else:
+        patrol_study.print_table(study)
+        print(f"Report: {report / 'index.html'}")
+
+
+# -- simulate -----------------------------------------------------------------------------------------
+
+
+@simulate.command("patrol")
+def simulate_patrol(
+    instance: Instance = 2,
+    observability: Annotated[int, typer.Option(help="Percent of the patrol in view (100: everything).")] = 30,
+    sessions: Annotated[int, typer.Option(min=1, help="Trajectories per patroller.")] = 60,
+    steps: Annotated[int, typer.Option(min=1, help="Steps of a trajectory.")] = 5,
+    seed: Seed = 0,
+) -> None:
+    """Write what a learner sees of the patrollers, one trajectory a line, to standard output."""
+    import jax
+
+    from ..domains.patrol import demonstrate
+    from ..domains.patrol import instance as patrol_instance
+    from ..models.demonstration import write_trajectories
+
+    with _reported_errors():
+        patrol = patrol_instance(instance)
+        demonstrations = demonstrate(jax.random.key(seed), patrol, observability, sessions, steps)
+        for i in range(sessions):
+            for agent, demonstration in enumerate(demonstrations):
+                name = f"{patrol.name}-{i}-{agent}"
+                write_trajectories(
+                    sys.stdout, demonstration.select([i]), patrol.mdp, ids=[name], agents=[agent]
+                )  # fmt: skip
+
+
+# -- learn --------------------------------------------------------------------------------------------
+
+
+@app.command()
+def learn(
+    mdp: Annotated[str, typer.Option(help="patrol1, patrol2, patrol3, labyrinth, or an MDP.npz file.")],
+    demos: Annotated[str, typer.Option(help="JSON Lines file of trajectories, or - for standard input.")],
+    journal: Annotated[Path, typer.Option(help="SQLite file that keeps every session; resumed if it exists.")],
+    observability: Annotated[
+        int | None, typer.Option(help="Percent in view, for the patrols; a file's in_view array otherwise.")
+    ] = None,
+    session_size: Annotated[int, typer.Option(min=1, help="Trajectories a session.")] = 1,
+    agent: Annotated[int | None, typer.Option(help="Learn from this agent's lines only.")] = None,
+    statistic: Annotated[str, typer.Option(help="What is kept of a session: seen, counts or features.")] = "seen",
+    solver: Annotated[str, typer.Option(help="newton, ipopt, cvxpy or 'exponentiated gradient'.")] = "newton",
+    slack: Annotated[float | None, typer.Option(min=0, help="L1 slack, nats per trajectory.")] = None,
+    ridge: Annotated[float, typer.Option(min=0, help="Precision of a Gaussian prior on the weights.")] = 0.0,
+    follow: Annotated[bool, typer.Option("--follow", help="Keep waiting for new lines at the end.")] = False,
+    seed: Annotated[int, typer.Option(help="Seed of the first weights; ignored when resuming.")] = 0,
+    as_json: Json = False,
+) -> None:
+    """Learn online from a stream of trajectories; safe to interrupt, and to run again.
+
+    Every session is on disk before the next begins. Run the same command again and it goes on where it
+    stopped, to the bit.
+    """
+    import jax
+
+    from ..inference.journal import Journal
+    from ..inference.lme import DEFAULT_SLACK, lme_i2rl
+    from .stream import learn_stream, open_lines
+
+    with _reported_errors():
+        process, sensor = _decision_process(mdp, observability)
+        learner = lme_i2rl(
+            process, sensor, statistic=statistic, solver=solver, ridge=ridge,
+            slack=DEFAULT_SLACK if slack is None else slack,
+        )  # fmt: skip
+        lines, source = open_lines(demos, follow)
+        with Journal.open(journal, learner) as opened, _progress(as_json) as advance:
+            before = opened.session
+
+            def report_session(report: Any) -> None:
+                if as_json:
+                    print(json.dumps(_plain(report._asdict())), flush=True)
+                advance(f"session {report.session}", None)
+
+            try:
+                done = learn_stream(
+                    learner, lines, opened, jax.random.key(seed), size=session_size, agent=agent,
+                    source=source, on_session=report_session,
+                )  # fmt: skip
+            except KeyboardInterrupt:
+                _say(f"Interrupted; {opened.session} sessions are in {journal}. Run again to go on.")
+                raise typer.Exit(130) from None
+            if not as_json:
+                _print_weights(process, opened.state)
+                print(f"{done} sessions learned ({before} were in {journal} before).")
+
+
+@app.command()
+def show(
+    journal: Annotated[Path, typer.Argument(help="A journal written by learn.")],
+    export: Annotated[Path | None, typer.Option(help="Also write the history to this NetCDF file.")] = None,
+    last: Annotated[int, typer.Option(min=1, help="Sessions to list.")] = 10,
+    as_json: Json = False,
+) -> None:
+    """Show what a journal holds; works while a learner is writing it."""
+    from ..inference.journal import Journal
+
+    with _reported_errors(), Journal.read(journal) as view:
+        records = list(view.reports())
+        if export is not None:
+            view.to_netcdf(export)
+        if as_json:
+            content = [
+                {"session": r.session, "committed": r.committed, "weights": r.weights.tolist(), **_plain(r.report)}
+                for r in records
+            ]
+            print(json.dumps({"origin": _plain(view.origin._asdict()), "sessions": content}))
+            return
+        _print_history(view, records, last)
+        if export is not None:
+            print(f"Exported to {export}")
+
+
+# -- shared -------------------------------------------------------------------------------------------
+
+
+def _decision_process(name: str, observability: int | None) -> tuple[TabularMDP, Imperfection]:
+    from ..models.evidence import Sensor, Visibility
+
+    if name in ("patrol1", "patrol2", "patrol3"):
+        from ..domains.patrol import instance
+
+        patrol = instance(int(name[-1]))
+        degree = (30, 30, 18)[int(name[-1]) - 1] if observability is None else observability
+        return patrol.mdp, patrol.visibility(degree)
+    if observability is not None:
+        raise ValueError("--observability is for the patrols; give an MDP file an in_view array instead")
+    if name == "labyrinth":
+        from ..domains.labyrinth import labyrinth
+
+        return labyrinth().mdp, Sensor()
+    if not name.endswith(".npz"):
+        raise ValueError(f"--mdp is patrol1, patrol2, patrol3, labyrinth or an .npz file, got {name!r}")
+    from ..models.storage import load_mdp
+
+    stored = load_mdp(name)
+    return stored.mdp, Sensor() if stored.in_view is None else Visibility(stored.in_view)
+
+
+@contextmanager
+def _reported_errors() -> Iterator[None]:
+    """Mistakes in what was given end with one clear line, not a traceback."""
+    from ..inference.journal import JournalError
+
+    try:
+        yield
+    except (ValueError, JournalError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        if os.environ.get("I2RL_TRACEBACK"):
+            raise
+        _say(f"Error: {error}")
+        raise typer.Exit(1) from None
+    except BrokenPipeError:
+        # The reader of our output (head, say) has had enough; Python must not complain at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        raise typer.Exit(0) from None
+
+
+@contextmanager
+def _progress(quiet: bool) -> Iterator[Any]:
+    """A progress bar on a terminal; ``advance(description, fraction)``, nothing elsewhere."""
+    if quiet or not sys.stderr.isatty():
+        yield lambda description, fraction: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
+    from rich.progress import BarColumn as Bar
+
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), Bar(), TimeElapsedColumn())
+    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+        task = bar.add_task("starting", total=None)
+
+        def advance(description: str, fraction: float | None) -> None:
+            total = None if fraction is None else 1.0
+            bar.update(task, description=description, total=total, completed=fraction or 0.0)
+
+        yield advance
+
+
+def _say(text: str) -> None:
+    print(text, file=sys.stderr)
+
+
+def _plain(value: Any) -> Any:
+    """Arrays and tuples as JSON takes them."""
+    if isinstance(value, dict):
+        return {k: _plain(v) for k, v in value.items()}
+    if isinstance(value, tuple | list):
+        return [_plain(v) for v in value]
+    return value.tolist() if hasattr(value, "tolist") else value
+
+
+def _print_weights(mdp: TabularMDP, state: Any) -> None:
+    if state is None:
+        return
+    import numpy as np
+    from rich.console import Console
+    from rich.table import Table
+
+    weights = np.asarray(state.weights)
+    table = Table(title=f"Reward after {int(state.session)} sessions")
+    table.add_column("feature")
+    table.add_column("weight", justify="right")
+    table.add_column("L1-normalised", justify="right")
+    scale = max(float(np.abs(weights).sum()), 1e-300)
+    for name, weight in zip(mdp.feature_names, weights, strict=True):
+        table.add_row(name, f"{weight:.3f}", f"{weight / scale:.3f}")
+    Console().print(table)
+
+
+def _print_history(view: Any, records: list[Any], last: int) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    origin = view.origin
+    console = Console()
+    console.print(f"{origin.method} on an MDP of {origin.n_states} states and {origin.n_actions} actions; "
+                  f"{len(records)} sessions")  # fmt: skip
+    if not records:
+        return
+    table = Table(title=f"Last {min(last, len(records))} sessions")
+    for column in ("session", "log-likelihood (nats/trajectory)", "EM steps", "seconds"):
+        table.add_column(column, justify="right")
+    for r in records[-last:]:
+        table.add_row(
+            str(r.session), f"{float(r.report['log_likelihood']):.4f}", str(int(r.report["iterations"])),
+            f"{float(r.report['seconds']):.4f}",
+        )  # fmt: skip
+    console.print(table)
+    weights = records[-1].weights
+    scale = max(float(abs(weights).sum()), 1e-300)
+    reward = Table(title="Reward weights")
+    for column in ("feature", "weight", "L1-normalised"):
+        reward.add_column(column, justify="left" if column == "feature" else "right")
+    for name, weight in zip(origin.feature_names, weights, strict=True):
+        reward.add_row(name, f"{weight:.3f}", f"{weight / scale:.3f}")
+    console.print(reward)
+
+
+def main() -> None:
+    """Entry point of the ``i2rl`` command."""
+    app()
+
+
+if __name__ == "__main__":
+    main()
