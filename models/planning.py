@@ -107,7 +107,7 @@ def _soft_values(
     mdp: TabularMDP, reward: Float[Array, "S A"], start: Float[Array, " S"]
 ) -> Float[Array, " S"]:
     if mdp.n_states > DIRECT_LIMIT:
-        return _fixed_point(lambda v: soft_backup(mdp, reward, v), start, mdp.discount)
+        return _fixed_point(lambda v: soft_backup(mdp, reward, v), start, mdp.discount, floor=1.0)
     return _policy_iteration(mdp, reward, start, lambda q: jax.nn.softmax(q, axis=1), jax.nn.logsumexp)
 
 
@@ -137,7 +137,7 @@ def hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: float = 1
 
     start = jnp.zeros(mdp.n_states)
     if mdp.n_states > DIRECT_LIMIT:
-        values = _fixed_point(backup, start, mdp.discount)
+        values = _fixed_point(backup, start, mdp.discount, floor=1.0)
     else:
         values = _policy_iteration(mdp, reward, start, greedy, jnp.max)
     q = action_values(mdp, reward, values)
@@ -157,7 +157,7 @@ def deterministic_policy(optimal: Bool[Array, "S A"]) -> Float[Array, "S A"]:
 
 
 def _precision(discount: Float[Array, ""]) -> Float[Array, ""]:
-    """Residual, relative to the solution, that places it within 1e-12, or at which rounding takes over."""
+    """Residual, relative to the solution, that places it within 1e-12, or that rounding alone may leave."""
     return jnp.maximum(1e-12 * (1 - discount), 16 * _EPS)
 
 
@@ -173,18 +173,20 @@ def _policy_iteration(
         return q, best_of(q, axis=1) - values
 
     def improve(carry: tuple) -> tuple:
-        values, q, gap, step = carry
+        values, q, gap, _, step = carry
         matrix = jnp.eye(mdp.n_states) - mdp.discount * mdp.state_transitions(policy_of(q))
         # Newton's form (correct the values by the residual) keeps rounding errors from accumulating.
         values = values + jnp.linalg.solve(matrix, gap)
-        return values, *residual(values), step + 1
+        return values, *residual(values), _largest(gap), step + 1
 
     def unfinished(carry: tuple) -> Bool[Array, ""]:
-        values, _, gap, step = carry
-        scale = 1 + jnp.max(jnp.abs(values))
-        return (jnp.max(jnp.abs(gap)) > _precision(mdp.discount) * scale) & (step < _MAX_STEPS)
+        values, _, gap, before, step = carry
+        left, scale = _largest(gap), 1 + _largest(values)
+        # Sums over many successors round further: there, what no longer shrinks is rounding.
+        rounding = (left < 1e-13 * scale) & (left > before / 2)
+        return (left > _precision(mdp.discount) * scale) & ~rounding & (step < _MAX_STEPS)
 
-    return lax.while_loop(unfinished, improve, (start, *residual(start), 0))[0]
+    return lax.while_loop(unfinished, improve, (start, *residual(start), jnp.array(jnp.inf), 0))[0]
 
 
 def _largest(x: Float[Array, " S"]) -> Float[Array, ""]:
@@ -197,13 +199,16 @@ def _fixed_point(
     discount: Float[Array, ""],
     size: Callable[[Float[Array, " S"]], Float[Array, ""]] = _largest,
     forcing: float = 1e-2,
+    floor: float = 0.0,
 ) -> Float[Array, " S"]:
     """Fixed point of a backup that contracts by ``discount`` in the norm ``size``.
 
     Inexact Newton: each step solves the linearised equation by BiCGSTAB to the relative residual
     ``forcing``. A step that gains less than ``_BACKUPS`` plain backups would is replaced by them, so that
-    convergence is never slower than successive approximation, whatever the chain.
+    convergence needs at most a few times the work of successive approximation, whatever the chain.
+    Precision is relative to ``floor`` plus the size of the solution.
     """
+    surely = discount**_BACKUPS
 
     def newton(x: Float[Array, " S"], gap: Float[Array, " S"]) -> Float[Array, " S"]:
         _, slope = jax.linearize(backup, x)
@@ -213,23 +218,25 @@ def _fixed_point(
         return x + correction
 
     def step(carry: tuple) -> tuple:
-        x, gap, count = carry
+        x, gap, _, count = carry
+        left = size(gap)
         ahead = newton(x, gap)
         ahead_gap = backup(ahead) - ahead
-        gains = size(ahead_gap) <= discount**_BACKUPS * size(gap)
+        gains = size(ahead_gap) <= surely * left
 
         def swept() -> tuple:
             y = lax.fori_loop(0, _BACKUPS, lambda _, y: backup(y), x)
             return y, backup(y) - y
 
         x, gap = lax.cond(gains, lambda: (ahead, ahead_gap), swept)
-        return x, gap, count + 1
+        # But for rounding, a step shrinks the residual: what no longer shrinks is rounding.
+        return x, gap, size(gap) < (1 + surely) / 2 * left, count + 1
 
     def unfinished(carry: tuple) -> Bool[Array, ""]:
-        x, gap, count = carry
-        return (size(gap) > _precision(discount) * size(x)) & (count < _MAX_STEPS)
+        x, gap, shrinking, count = carry
+        return (size(gap) > _precision(discount) * (floor + size(x))) & shrinking & (count < _MAX_STEPS)
 
-    return lax.while_loop(unfinished, step, (start, backup(start) - start, 0))[0]
+    return lax.while_loop(unfinished, step, (start, backup(start) - start, jnp.array(True), 0))[0]
 
 
 def solve_values(
@@ -263,8 +270,7 @@ def solve_values(
             )
 
         def iterate_back(_: object, b: Array) -> Array:
-            # Gathering from predecessors, where autodiff's transpose would scatter; and the transposed
-            # chain contracts in the sum of absolute values, not in the largest.
+            # The transposed chain contracts in the sum of absolute values, not in the largest.
             return _by_column(
                 lambda c: _fixed_point(
                     lambda x: c + spread(x), c, fixed.discount, lambda x: jnp.sum(jnp.abs(x)), forcing=1e-8

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -60,11 +58,8 @@ def test_the_log_likelihood_is_differentiable_in_transitions_and_start(random_md
     mdp, live = random_mdp(1, n_successors=3), jnp.ones(L, bool)
     factors = jnp.where(jnp.isfinite(random_factors(1)), random_factors(1), -3.0)
 
-    # The inflow table holds the same numbers again: without it, one copy is left to vary.
     def likelihood(probabilities, initial):
-        varied = replace(
-            mdp, probabilities=probabilities, initial=initial, inflow_pairs=None, inflow_probabilities=None
-        )
+        varied = mdp.with_probabilities(probabilities).with_initial(initial)
         return filter_forward(varied, factors, live).log_likelihood
 
     function = jax.jit(likelihood)
