@@ -103,9 +103,18 @@ class Patrol(NamedTuple):
         return Visibility(self.views[observability])
 
     def expert_policy(self) -> Float[np.ndarray, "S A"]:
-        """The patrollers' deterministic optimal policy; ties go right before left, as in the released code."""
-        optimal = np.asarray(hard_plan(self.mdp, reward_of(self.mdp, jnp.asarray(self.weights))).optimal)
-        return break_ties(optimal)
+        """The patrollers' optimal policy; ties go right before left, as in the released code."""
+        return greedy_policy(self.mdp, self.weights)
+
+
+def greedy_policy(mdp: TabularMDP, weights: Float[np.ndarray, " K"]) -> Float[np.ndarray, "S A"]:
+    """The deterministic policy that is optimal under some weights, ties broken by :func:`break_ties`."""
+    return break_ties(np.asarray(_optimal(mdp, jnp.asarray(weights, float))))
+
+
+@jax.jit
+def _optimal(mdp: TabularMDP, weights: Float[Array, " K"]) -> Bool[Array, "S A"]:
+    return hard_plan(mdp, reward_of(mdp, weights)).optimal
 
 
 def break_ties(optimal: Bool[np.ndarray, "S A"]) -> Float[np.ndarray, "S A"]:
@@ -179,7 +188,8 @@ def _simulate(
         return (following, here, counter - 1), (states, action)
 
     begin = (jnp.asarray(start, mdp.successors.dtype), jnp.full(patrollers, -1), jnp.array(0))
-    _, (states, actions) = lax.scan(step, begin, jax.random.split(key, steps))
+    walked: tuple = lax.scan(step, begin, jax.random.split(key, steps))[1]
+    states, actions = walked
     return states.T, actions.T
 
 
@@ -364,11 +374,11 @@ def boyd_with_rooms() -> Patrol:
     The turning feature fires on left turns in the hallways only, as in the released code (the dissertation
     says any turn). The learner's start, (0,17) facing west, is a reconstruction.
     """
-    rooms = frozenset([(r, 10) for r in range(1, 6)] + [(2, c) for c in range(4, 10)] + [(5, c) for c in range(13, 16)])
-    cells = (
-        frozenset([(0, c) for c in range(17)] + [(r, 16) for r in range(1, 13)] + [(13, c) for c in range(14, 17)])
-        | rooms
-    )
+    first_room = [(r, 10) for r in range(1, 6)] + [(2, c) for c in range(4, 10)]
+    second_room = [(5, c) for c in range(13, 16)]
+    rooms = frozenset(first_room + second_room)
+    top, right = [(0, c) for c in range(17)], [(r, 16) for r in range(1, 13)]
+    cells = rooms.union(top, right, [(13, c) for c in range(14, 17)])
 
     def features(state: State, action: int, target: State) -> tuple[bool, ...]:
         moved = target.cell != state.cell
@@ -398,7 +408,9 @@ def boyd_with_rooms() -> Patrol:
         "patrol3", _grid_states(cells), _walk(cells), features,
         ("moves", "in a room", "turns left in hallway", "enters a room", "leaves a room"),
         (1.0, -1.0, 0.1, 0.0, 0.0), success=0.99, discount=0.99, patrollers=2,
-        views={9: view(*k1), 18: view(*k2), 33: view(*k4), 46: view(*k6), 65: view(*k10), 100: lambda s: True},
+        views={
+            9: view(*k1), 18: view(*k2), 33: view(*k4), 46: view(*k6), 65: view(*k10), 100: lambda s: True
+        },
         breach=Breach(
             tuple(sorted(cells | {(0, 17), (1, 0), (13, 13)})), State(0, 17, 2), ((1, 0), (13, 13)), 0.95
         ),
