@@ -1,0 +1,55 @@
+"""Shared by the benchmarks: medians of several runs, a JSON file, and a table."""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import time
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+DEFAULT_FOLDER = Path("build/bench")
+
+
+def seconds(action: Callable[[], Any]) -> float:
+    """Wall-clock seconds of one call."""
+    began = time.perf_counter()
+    action()
+    return time.perf_counter() - began
+
+
+def median_seconds(action: Callable[[], Any], runs: int = 5) -> float:
+    """Median over several calls, after one that compiles."""
+    action()
+    return float(np.median([seconds(action) for _ in range(runs)]))
+
+
+def machine() -> dict[str, Any]:
+    """What the numbers were measured on."""
+    load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
+    return {"cores": os.cpu_count(), "python": platform.python_version(), "load": round(load, 2)}
+
+
+def publish(name: str, results: Mapping[str, Any], path: Path | None = None) -> None:
+    """Write results as JSON (to ``build/bench/NAME.json``) with the machine they were measured on."""
+    path = DEFAULT_FOLDER / f"{name}.json" if path is None else path
+    path.parent.mkdir(parents=True, exist_ok=True)
+    path.write_text(json.dumps({"machine": machine(), **results}, indent=2) + "\n")
+    print(f"Written to {path}")
+
+
+def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
+    """Print rows as a table; numbers to four significant digits."""
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title)
+    for i, column in enumerate(columns):
+        table.add_column(column, justify="left" if i == 0 else "right")
+    for row in rows:
+        table.add_row(*(f"{x:.4g}" if isinstance(x, float) else str(x) for x in row))
+    Console(width=140).print(table)

@@ -1,0 +1,134 @@
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from i2rl.inference import (
+    LearningErrorChange,
+    LikelihoodChange,
+    MovingWindow,
+    Report,
+    average_regret,
+    fleet,
+    lme_i2rl,
+    run_sessions,
+)
+from i2rl.models import Demonstration, Visibility, concatenate
+
+
+def report(session=1, log_likelihood=0.0, residual=0.0, weights=(0.0,)):
+    return Report(session, log_likelihood, log_likelihood, residual, 1, 1, 0.0, np.array(weights, float))
+
+
+@pytest.fixture(scope="module")
+def world(random_mdp):
+    mdp = random_mdp(3, n_states=6, n_actions=3, n_successors=2, n_features=2)
+    return mdp, Visibility(np.arange(6) < 4)
+
+
+@pytest.fixture(scope="module")
+def stream(world, imperfect_demonstration):
+    mdp, sensor = world
+    policy = np.log(np.full((6, 3), 1 / 3))
+    return imperfect_demonstration(0, mdp, policy, sensor, 8, 4)
+
+
+def test_criterion_one_stops_when_the_likelihood_settles():
+    stop = LikelihoodChange(0.1)
+    assert not stop([report(1, -3.0)])
+    assert not stop([report(1, -3.0), report(2, -2.0)])
+    assert stop([report(1, -3.0), report(2, -2.0), report(3, -2.05)])
+
+
+def test_criterion_two_stops_when_the_learning_error_settles(random_mdp):
+    mdp = random_mdp(1, n_features=2)
+    true = np.array([1.0, -1.0])
+    stop = LearningErrorChange(1e-6, mdp, true)
+    wrong, right = report(1, weights=-true), report(2, weights=true)
+    assert not stop([wrong])
+    assert not stop([wrong, right])
+    assert stop([wrong, right, right])
+    # The error that got worse fell by a negative amount, which is also at most rho.
+    assert stop([right, wrong])
+
+
+def test_the_moving_window_ignores_a_pause():
+    stop = MovingWindow(3, 0.05)
+    reports = [report(i, x) for i, x in enumerate([-3.0, -2.0, -2.0])]
+    assert LikelihoodChange(0.05)(reports)
+    assert not stop(reports)
+    assert stop([*reports, report(4, -2.0)])
+    assert MovingWindow(2, 0.1, of="residual")([report(residual=1.0), report(residual=1.05)])
+
+
+def test_average_regret_is_the_running_mean_of_the_likelihood_given_away():
+    assert np.allclose(average_regret(np.array([0.0, 0.0, 0.0]), np.array([-3.0, -1.0, 1.0])), [3, 2, 1])
+    with pytest.raises(ValueError, match="one length"):
+        average_regret(np.zeros(2), np.zeros(3))
+
+
+def test_sessions_run_until_the_stream_ends_or_a_criterion_says_so(world, stream):
+    learner = lme_i2rl(*world)
+    seen = []
+    whole = run_sessions(
+        learner, stream.sessions(), key=jax.random.key(0), on_session=lambda s, r: seen.append(r.session)
+    )
+    assert seen == list(range(1, 9))
+    assert not whole.stopped
+    short = run_sessions(learner, stream.sessions(), key=jax.random.key(0), stop=LikelihoodChange(np.inf))
+    assert short.stopped
+    assert len(short.reports) == 2
+
+
+def test_a_run_continued_from_a_state_equals_an_uninterrupted_one_to_the_bit(world, stream):
+    learner = lme_i2rl(*world)
+    whole = run_sessions(learner, stream.sessions(), key=jax.random.key(0)).state
+    half = run_sessions(learner, stream.select(slice(0, 4)).sessions(), key=jax.random.key(0)).state
+    rest = run_sessions(learner, stream.select(slice(4, 8)).sessions(), state=half).state
+    same = jax.tree.map(lambda a, b: bool(jnp.all(a == b)), whole._replace(key=0), rest._replace(key=0))
+    assert all(jax.tree.leaves(same))
+    assert jnp.all(jax.random.key_data(whole.key) == jax.random.key_data(rest.key))
+
+
+def test_a_run_needs_somewhere_to_start(world, stream):
+    with pytest.raises(ValueError, match="key, a state or a journal"):
+        run_sessions(lme_i2rl(*world), stream.sessions())
+
+
+def test_a_fleet_learns_what_each_learner_alone_would(world, stream):
+    learner = lme_i2rl(*world)
+    many = fleet(learner)
+    states = many.init(jax.random.key(5), 3)
+    streams = [stream.select([i, i + 1]) for i in range(3)]
+    stacked = Demonstration(*(np.stack(parts) for parts in zip(*streams, strict=True)))
+    states, reports = many.update(states, stacked)
+    keys = jax.random.split(jax.random.key(5), 3)
+    for i, one in enumerate(streams):
+        state, alone = learner.update(learner.init(keys[i]), one)
+        assert np.allclose(states.weights[i], state.weights, atol=1e-6)
+        assert np.allclose(reports.log_likelihood[i], alone.log_likelihood, atol=1e-8)
+
+
+def test_a_learner_whose_solver_is_outside_jax_makes_no_fleet(world):
+    with pytest.raises(ValueError, match="outside JAX"):
+        fleet(lme_i2rl(*world, solver="ipopt"))
+
+
+def test_the_signature_tells_methods_and_worlds_apart(world, random_mdp):
+    mdp, sensor = world
+    same, again = lme_i2rl(mdp, sensor), lme_i2rl(mdp, sensor)
+    assert same.signature == again.signature
+    others = [
+        lme_i2rl(mdp, sensor, slack=0.5),
+        lme_i2rl(mdp, Visibility(np.ones(6))),
+        lme_i2rl(random_mdp(4, n_states=6, n_features=2), sensor),
+    ]
+    assert len({same.signature, *(other.signature for other in others)}) == 4
+
+
+def test_what_is_carried_does_not_grow_with_the_sessions(world, stream):
+    learner = lme_i2rl(*world)
+    state = learner.init(jax.random.key(0))
+    before = [np.shape(x) for x in jax.tree.leaves(state)]
+    state = run_sessions(learner, concatenate([stream, stream]).sessions(), state=state).state
+    assert [np.shape(x) for x in jax.tree.leaves(state)] == before

@@ -1,0 +1,65 @@
+import numpy as np
+import pytest
+
+from i2rl.domains.patrol import instance
+from i2rl.models.storage import load_mdp, save_mdp
+
+
+def test_an_mdp_survives_the_file(tmp_path):
+    patrol = instance(1)
+    save_mdp(tmp_path / "m.npz", patrol.mdp, patrol.views[30])
+    stored = load_mdp(tmp_path / "m.npz")
+    assert stored.mdp.fingerprint() == patrol.mdp.fingerprint()
+    assert stored.mdp.action_names == patrol.mdp.action_names
+    assert np.array_equal(stored.in_view, patrol.views[30])
+
+
+def test_an_archive_needs_only_transitions_and_features(tmp_path):
+    np.savez(
+        tmp_path / "m.npz",
+        successors=np.zeros((2, 1, 1), int),
+        probabilities=np.ones((2, 1, 1)),
+        features=np.ones((2, 1, 1)),
+    )
+    stored = load_mdp(tmp_path / "m.npz")
+    assert stored.in_view is None
+    assert np.allclose(stored.mdp.initial, 0.5)
+
+
+def write_archive(path, **changes):
+    arrays = {
+        "successors": np.zeros((2, 1, 1), int),
+        "probabilities": np.ones((2, 1, 1)),
+        "features": np.ones((2, 1, 1)),
+    } | changes
+    np.savez(path, **{k: v for k, v in arrays.items() if v is not None})
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"features": None}, "misses the array 'features'"),
+        ({"reward": np.ones(2)}, "unknown array 'reward'"),
+        ({"probabilities": np.full((2, 1, 1), 0.5)}, "sum to 1"),
+        ({"in_view": np.ones(3)}, r"in_view must have shape \[2\]"),
+        ({"states": np.array(["a", "a"])}, "repeated: a"),
+    ],
+)
+def test_errors_name_the_file_and_the_fault(tmp_path, changes, message):
+    path = tmp_path / "world.npz"
+    write_archive(path, **changes)
+    with pytest.raises(ValueError, match=message) as caught:
+        load_mdp(path)
+    assert "world.npz" in str(caught.value)
+
+
+def test_pickles_are_refused(tmp_path):
+    write_archive(tmp_path / "m.npz", states=np.array([object(), object()], dtype=object))
+    with pytest.raises(ValueError, match="not an MDP archive"):
+        load_mdp(tmp_path / "m.npz")
+
+
+def test_a_file_that_is_no_archive_is_refused(tmp_path):
+    (tmp_path / "m.npz").write_text("hello")
+    with pytest.raises(ValueError, match="not an MDP archive"):
+        load_mdp(tmp_path / "m.npz")
