@@ -1,0 +1,47 @@
+"""What is concluded: metrics, figures, studies, benchmarks, and the command line."""
+
+import importlib
+from typing import Any
+
+_HOMES = {
+    "figures": (
+        "LearningCurve",
+        "LearningTime",
+        "SuccessRate",
+        "learning_curves",
+        "learning_time",
+        "success_rates",
+        "weights_plot",
+    ),
+    "maps": ("hidden_path", "policy_map"),
+    "metrics": (
+        "Accuracy",
+        "Evaluation",
+        "LearningError",
+        "demonstration_log_likelihoods",
+        "evaluate",
+        "greedy_policy",
+        "inverse_learning_error",
+        "learned_behavior_accuracy",
+        "learned_value",
+        "optimal_actions",
+        "policy_accuracy",
+        "policy_error",
+        "quantile_band",
+    ),
+    "report": ("Picture", "Section", "Table", "write_report"),
+    "stream": ("learn_stream",),
+    "style": ("DARK", "LIGHT", "Theme", "save", "save_themes"),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
+__all__ = sorted(_HOME_OF)
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_HOME_OF[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return list(__all__)

@@ -26,7 +26,9 @@ app = typer.Typer(
     add_completion=False,
     pretty_exceptions_enable=False,
 )
-run = typer.Typer(help="Do a whole study: learn, evaluate, and write a report with pictures.", no_args_is_help=True)
+run = typer.Typer(
+    help="Do a whole study: learn, evaluate, and write a report with pictures.", no_args_is_help=True
+)
 simulate = typer.Typer(help="Write simulated demonstrations as JSON Lines.", no_args_is_help=True)
 app.add_typer(run, name="run")
 app.add_typer(simulate, name="simulate")
@@ -48,7 +50,9 @@ Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the sa
 
 @app.callback()
 def _version(
-    version: Annotated[bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)] = False,
+    version: Annotated[
+        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)
+    ] = False,
 ) -> None:
     if version:
         from ..version import __version__
@@ -64,7 +68,8 @@ def _version(
 def run_patrol(
     instance: Instance = 2,
     observability: Annotated[
-        int | None, typer.Option(help="Percent of the patrol in view; by default the dissertation's (30, 30, 18).")
+        int | None,
+        typer.Option(help="Percent of the patrol in view; by default the dissertation's (30, 30, 18)."),
     ] = None,
     sessions: Annotated[int, typer.Option(min=1, help="Sessions of five steps a patroller.")] = 60,
     method: Annotated[Method, typer.Option(help="Which learners to run.")] = Method.all,
@@ -74,7 +79,7 @@ def run_patrol(
     report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report"),
     as_json: Json = False,
 ) -> None:
-    """Watch patrollers through a keyhole, learn their reward session by session, and walk past them unseen."""
+    """Watch patrollers through a keyhole, learn their reward online, and walk past them unseen."""
     from . import patrol_study
 
     with _reported_errors(), _progress(as_json) as advance:
@@ -126,13 +131,17 @@ def simulate_patrol(
 def learn(
     mdp: Annotated[str, typer.Option(help="patrol1, patrol2, patrol3, labyrinth, or an MDP.npz file.")],
     demos: Annotated[str, typer.Option(help="JSON Lines file of trajectories, or - for standard input.")],
-    journal: Annotated[Path, typer.Option(help="SQLite file that keeps every session; resumed if it exists.")],
+    journal: Annotated[
+        Path, typer.Option(help="SQLite file that keeps every session; resumed if it exists.")
+    ],
     observability: Annotated[
         int | None, typer.Option(help="Percent in view, for the patrols; a file's in_view array otherwise.")
     ] = None,
     session_size: Annotated[int, typer.Option(min=1, help="Trajectories a session.")] = 1,
     agent: Annotated[int | None, typer.Option(help="Learn from this agent's lines only.")] = None,
-    statistic: Annotated[str, typer.Option(help="What is kept of a session: seen, counts or features.")] = "seen",
+    statistic: Annotated[
+        str, typer.Option(help="What is kept of a session: seen, counts or features.")
+    ] = "seen",
     solver: Annotated[str, typer.Option(help="newton, ipopt, cvxpy or 'exponentiated gradient'.")] = "newton",
     slack: Annotated[float | None, typer.Option(min=0, help="L1 slack, nats per trajectory.")] = None,
     ridge: Annotated[float, typer.Option(min=0, help="Precision of a Gaussian prior on the weights.")] = 0.0,
@@ -195,7 +204,12 @@ def show(
             view.to_netcdf(export)
         if as_json:
             content = [
-                {"session": r.session, "committed": r.committed, "weights": r.weights.tolist(), **_plain(r.report)}
+                {
+                    "session": r.session,
+                    "committed": r.committed,
+                    "weights": r.weights.tolist(),
+                    **_plain(r.report),
+                }
                 for r in records
             ]
             print(json.dumps({"origin": _plain(view.origin._asdict()), "sessions": content}))
@@ -256,10 +270,9 @@ def _progress(quiet: bool) -> Iterator[Any]:
         yield lambda description, fraction: None
         return
     from rich.console import Console
-    from rich.progress import Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
-    from rich.progress import BarColumn as Bar
+    from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), Bar(), TimeElapsedColumn())
+    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None)
 

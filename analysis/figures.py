@@ -102,7 +102,7 @@ def learning_time(
                 f"the seconds of {time.method} must be positive to be shown on a logarithmic scale"
             )
         _draw_band(axes, theme, i, time.method, time.trajectories, time.seconds, coverage)
-    dress(axes, theme, x="trajectories seen", y="cumulative learning time (s)")
+    dress(axes, theme, x="trajectories seen", y="learning time (s)")
     _scale(axes, "x", "log")
     _scale(axes, "y", "log")
     head(figure, theme, axes.get_legend_handles_labels()[0], title=title, columns=2)

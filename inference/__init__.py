@@ -30,6 +30,7 @@ _HOMES = {
         "fit_state_rewards",
         "fit_weights",
     ),
+    "posterior": ("sample_posterior",),
     "session": (
         "Fleet",
         "Learner",

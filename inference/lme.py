@@ -7,8 +7,9 @@ exponentiated gradient, which can express neither negative weights nor a sharper
 
 from __future__ import annotations
 
+import hashlib
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -189,7 +190,13 @@ def me_i2rl(mdp: TabularMDP, **options: Any) -> Learner:
 
 
 def _method(
-    mdp: TabularMDP, sensor: Imperfection, statistic: str, completion: str, slack: float, ridge: float, draws: int
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    statistic: str,
+    completion: str,
+    slack: float,
+    ridge: float,
+    draws: int,
 ) -> _Method:
     samplers = {"blocked": blocked_posterior, "gibbs": gibbs_posterior}
     if statistic not in STATISTICS:
@@ -209,8 +216,6 @@ def _method(
 
 def _digest(sensor: Imperfection) -> str:
     """Identifies a sensor in a configuration."""
-    import hashlib
-
     digest = hashlib.sha256(type(sensor).__name__.encode())
     for leaf in jax.tree.leaves(sensor):
         digest.update(np.ascontiguousarray(leaf).tobytes())
@@ -298,28 +303,28 @@ def _close(
     own = jnp.sum(completed.expectations.log_likelihood)
     carried = statistic.log_likelihood(mdp, point.weights, plan.values, state.statistic)
     size = state.statistic.size + new.size
-    report = Report(
-        session=state.session + 1,
-        log_likelihood=(own + carried * state.statistic.size) / jnp.maximum(size, 1.0),
-        demonstration_log_likelihood=own,
-        residual=point.residual,
-        iterations=point.iterations,
-        solver_iterations=point.solver_iterations,
-        seconds=jnp.array(jnp.nan),
-        weights=point.weights,
-    )  # fmt: skip
+    fields: dict[str, Any] = {
+        "session": state.session + 1,
+        "log_likelihood": (own + carried * state.statistic.size) / jnp.maximum(size, 1.0),
+        "demonstration_log_likelihood": own,
+        "residual": point.residual,
+        "iterations": point.iterations,
+        "solver_iterations": point.solver_iterations,
+        "seconds": jnp.array(jnp.nan),
+        "weights": point.weights,
+    }
     kept = blend(state.statistic, new)
-    return LMEState(point.weights, kept, plan.values, program, state.session + 1, key), report
+    return LMEState(point.weights, kept, plan.values, program, state.session + 1, key), Report(**fields)
 
 
 def _learner(
     name: str,
     method: _Method,
-    start: Callable[[_Method, Array, LMEState], tuple],
+    start: Callable[[Array, LMEState], tuple],
     solver: str,
     iterations: int,
     tolerance: float,
-    configuration: dict[str, Any],
+    configuration: Mapping[str, Any],
 ) -> Learner:
     mdp = method.mdp
     in_jax = {"newton": _newton, "exponentiated gradient": _exponentiated}
@@ -334,13 +339,22 @@ def _learner(
         key, fresh = jax.random.split(state.key)
         return evidence, seen, key, *start(fresh, state)
 
-    program_session = None
+    run: Callable[[LMEState, Demonstration], tuple[LMEState, Report]]
     if solver in in_jax:
 
         def session(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
             evidence, seen, key, weights, values = begin(state, demonstration)
             point = _em(
-                method, in_jax[solver], iterations, tolerance, state.statistic, evidence, seen, key, weights, values
+                method,
+                in_jax[solver],
+                iterations,
+                tolerance,
+                state.statistic,
+                evidence,
+                seen,
+                key,
+                weights,
+                values,
             )
             return _close(method, state, point, state.program, evidence, seen)
 
@@ -354,37 +368,39 @@ def _learner(
         closing = jax.jit(partial(_close, method))
 
         @jax.jit
-        def expectation(kept: Any, key: Array, weights: Array, values: Array, evidence: Evidence, seen: Array) -> tuple:
+        def expectation(
+            kept: Any, key: Array, weights: Array, values: Array, evidence: Evidence, seen: Array
+        ) -> tuple:
             key, sample = jax.random.split(key)
             plan = method.plan(weights, values)
             working = method.working(kept, sample, plan, evidence, seen)
             return key, plan.values, working, *method.penalties(working)
 
-        def program_session(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
+        def run(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
             evidence, seen, key, weights, values = opening(state, demonstration)
-            program, total, residual, done = state.program, 0, np.inf, 0
-            for done in range(1, iterations + 1):
+            program, total, steps, change = state.program, 0, 0, np.inf
+            while steps < iterations and change > tolerance:
                 key, values, working, slack, ridge = expectation(
                     state.statistic, key, weights, values, evidence, seen
                 )
                 solution, program = solve(working, slack, ridge, program)
                 change = float(_change(weights, jnp.asarray(solution.weights)))
                 weights, values = jnp.asarray(solution.weights), jnp.asarray(solution.values)
-                total, residual = total + int(solution.iterations), 0.0
-                if change <= tolerance:
-                    break
-            point = _Iterate(
-                weights, values, jnp.array(change), jnp.array(residual), jnp.array(done), jnp.array(total), key
-            )
+                total, steps = total + int(solution.iterations), steps + 1
+            counted = (jnp.array(change), jnp.array(jnp.nan), jnp.array(steps), jnp.array(total))
+            point = _Iterate(weights, values, *counted, key)
             return closing(state, point, program, evidence, seen)
-
-        run = program_session
 
     def init(key: Array) -> LMEState:
         key, fresh = jax.random.split(key)
         weights = _random_weights(fresh, mdp)
         return LMEState(
-            weights, method.statistic.empty(mdp), jnp.zeros(mdp.n_states), empty_program, jnp.zeros((), int), key
+            weights,
+            method.statistic.empty(mdp),
+            jnp.zeros(mdp.n_states),
+            empty_program,
+            jnp.zeros((), int),
+            key,
         )
 
     def update(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
@@ -393,8 +409,9 @@ def _learner(
         if not np.isfinite(report.demonstration_log_likelihood):
             require_possible(method.sensor, mdp, demonstration)
             raise DemonstrationError("a trajectory has probability zero under the current policy")
-        numbers = [np.asarray(x).item() for x in report[:-2]]
-        return new, Report(*numbers, time.perf_counter() - began, np.asarray(report.weights))
+        arrays = {name: np.asarray(value) for name, value in report._asdict().items()}
+        values: dict[str, Any] = {name: x if x.ndim else x.item() for name, x in arrays.items()}
+        return new, Report(**values)._replace(seconds=time.perf_counter() - began)
 
     return Learner(name, mdp, configuration, init, update, session if solver in in_jax else None)
 
@@ -457,7 +474,16 @@ def batch_lme(
         def from_start(key: Array) -> tuple:
             weights = _random_weights(key, mdp)
             point = _em(
-                method, _newton, iterations, tolerance, kept, evidence, seen, key, weights, jnp.zeros(mdp.n_states)
+                method,
+                _newton,
+                iterations,
+                tolerance,
+                kept,
+                evidence,
+                seen,
+                key,
+                weights,
+                jnp.zeros(mdp.n_states),
             )
             plan = method.plan(point.weights, point.values)
             expectations = method.e_step(key, plan, evidence, seen).expectations

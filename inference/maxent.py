@@ -395,7 +395,7 @@ def quadratic_l1(
 def exponentiated_gradient(
     mdp: TabularMDP,
     target: FeatureTarget,
-    epsilon: float = 0.01,
+    epsilon: ArrayLike = 0.01,
     rate: float | None = None,
     start: Float[Array, " K"] | None = None,
     max_steps: int = 10_000,
@@ -453,7 +453,8 @@ def _exponentiated_gradient(
 ) -> Solution:
     def visit(weights: Float[Array, " K"], values: Float[Array, " S"]) -> tuple:
         plan = soft_plan(mdp, reward_of(mdp, weights), values)
-        return weights, plan.values, target.features - feature_expectations(mdp, plan.policy, target.start)
+        expected = feature_expectations(mdp, plan.policy, jnp.asarray(target.start))
+        return weights, plan.values, target.features - expected
 
     def step(carry: tuple) -> tuple:
         (weights, values, gap), steps = carry

@@ -33,8 +33,8 @@ class FeatureTarget(NamedTuple):
         ``p0``: distribution of the first state of these trajectories.
     """
 
-    features: Float[Array, " K"]
-    start: Float[Array, " S"]
+    features: Float[Array, " K"] | Float[np.ndarray, " K"]
+    start: Float[Array, " S"] | Float[np.ndarray, " S"]
 
 
 def checked_problem(mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike) -> tuple[np.ndarray, ...]:

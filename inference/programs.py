@@ -26,7 +26,9 @@ def host_solver(mdp: TabularMDP, solver: str, statistic: str) -> tuple[Solve, An
 
         def solve_primal(kept: Any, slack: Any, ridge: Any, warm: Any) -> tuple[Any, Any]:
             if float(ridge) > 0:
-                raise ValueError("the primal program has no ridge: use the newton or ipopt solver with a prior")
+                raise ValueError(
+                    "the primal program has no ridge: use the newton or ipopt solver with a prior"
+                )
             return primal.solve(_target(kept), np.asarray(slack)), warm
 
         return solve_primal, ()

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class Report(NamedTuple):
-    """What a session did.
+    """What a session did: plain numbers (from a fleet, arrays with one entry a stream).
 
     Fields
     ------
@@ -39,7 +39,8 @@ class Report(NamedTuple):
     demonstration_log_likelihood : float
         Exact log-likelihood (nats, hidden steps summed out) of this session's demonstration alone.
     residual : float
-        Violation of the last program's optimality conditions, in units of the features.
+        Violation of the last program's optimality conditions, in units of the features; NaN from solvers
+        outside JAX, which raise instead.
     iterations : int
         E- and M-steps.
     solver_iterations : int
@@ -98,7 +99,9 @@ def fleet(learner: Learner) -> Fleet:
     are not checked: an impossible one shows as a log-likelihood of minus infinity.
     """
     if learner.session is None:
-        raise ValueError(f"{learner.name} solves its programs outside JAX, so it cannot be mapped over streams")
+        raise ValueError(
+            f"{learner.name} solves its programs outside JAX, so it cannot be mapped over streams"
+        )
     update = jax.jit(jax.vmap(learner.session))
     init = jax.vmap(learner.init)
     return Fleet(lambda key, streams: init(jax.random.split(key, streams)), update)
@@ -225,5 +228,7 @@ def average_regret(
     """
     expert, learned = np.asarray(expert, float), np.asarray(learned, float)
     if expert.shape != learned.shape or expert.ndim != 1:
-        raise ValueError(f"log-likelihoods must be two lists of one length, got {expert.shape} and {learned.shape}")
+        raise ValueError(
+            f"log-likelihoods must be two lists of one length, got {expert.shape} and {learned.shape}"
+        )
     return np.cumsum(expert - learned) / np.arange(1, len(expert) + 1)

@@ -24,6 +24,7 @@ from .demonstration import (
 )
 from .evidence import Imperfection, ObservationModel, Sensor, Visibility, log_evidence, require_possible
 from .mdp import TabularMDP
+from .occlusion import occlusion_model, weights_prior
 from .planning import (
     FinitePlan,
     HardPlan,
@@ -42,6 +43,7 @@ from .planning import (
     simulate,
     soft_plan,
 )
+from .storage import load_mdp, save_mdp
 from .trajectory import TrajectoryLaw, sample_demonstration
 
 __all__ = [
@@ -65,7 +67,9 @@ __all__ = [
     "finite_occupancy",
     "finite_soft_plan",
     "hard_plan",
+    "load_mdp",
     "log_evidence",
+    "occlusion_model",
     "occupancy",
     "policy_values",
     "reachable_states",
@@ -73,7 +77,9 @@ __all__ = [
     "require_possible",
     "reward_of",
     "sample_demonstration",
+    "save_mdp",
     "simulate",
     "soft_plan",
+    "weights_prior",
     "write_trajectories",
 ]

@@ -210,7 +210,7 @@ def test_learning_time_is_on_logarithmic_scales_with_plain_numbers() -> None:
     figure = drawn(figures.learning_time(times))
     (axes,) = charts(figure)
     assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
-    assert axes.get_ylabel() == "cumulative learning time (s)"
+    assert axes.get_ylabel() == "learning time (s)"
     assert {"1", "10", "100"} <= {label.get_text() for label in axes.get_xticklabels()}
     with pytest.raises(ValueError, match="batch must be positive"):
         figures.learning_time([times[1]._replace(seconds=np.zeros((1, 3)))])

@@ -180,7 +180,9 @@ def test_an_impossible_observation_names_its_place_and_costs_nothing_learned(mdp
     learner = lme_i2rl(mdp, sensor)
     before, _ = learner.update(learner.init(jax.random.key(0)), Demonstration.from_pairs([[0]], [[1]]))
     out_of_view = Demonstration.from_steps([[(0, 0)], ["hidden", (5, 1)]], mdp)
-    with pytest.raises(DemonstrationError, match=r"trajectory 1, step 1: impossible observation.*excludes it"):
+    with pytest.raises(
+        DemonstrationError, match=r"trajectory 1, step 1: impossible observation.*excludes it"
+    ):
         learner.update(before, out_of_view)
     after, report = learner.update(before, Demonstration.from_pairs([[0]], [[1]]))
     assert report.session == 2

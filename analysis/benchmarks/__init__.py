@@ -1,0 +1,1 @@
+"""Measurements of speed, memory and statistical behaviour; run by ``make bench``."""

@@ -14,6 +14,7 @@ from __future__ import annotations
 import argparse
 import resource
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import jax
@@ -106,7 +107,7 @@ def online_against_batch(sessions: int, runs: int, rerun_points: int = 12) -> di
             part = demonstration.select(slice(0, int(n)))
             if seed == 0:
                 batch.fit(key, part)
-            spent.append(seconds(lambda part=part, key=key: batch.fit(key, part)))
+            spent.append(seconds(partial(batch.fit, key, part)))
         if seed == 0:
             continue
         total = sum(r.seconds for r in run_sessions(learner, demonstration.sessions(), key=key).reports)
@@ -161,13 +162,18 @@ def main() -> None:
         "online against batch": lambda: online_against_batch(options.sessions, options.runs),
         "seconds against states": lambda: {str(n): session_cost(ring(n), 5, 1) for n in (32, 124, 496, 1024)},
         "seconds against length": lambda: {str(n): session_cost(ring(124), n, 1) for n in (5, 20, 80, 320)},
-        "seconds against trajectories": lambda: {str(n): session_cost(ring(124), 5, n) for n in (1, 4, 16, 64)},
+        "seconds against trajectories": lambda: {
+            str(n): session_cost(ring(124), 5, n) for n in (1, 4, 16, 64)
+        },
     }
     results = {}
     for title, study in studies.items():
         values = results[title] = study()
         rows = [
-            (f"{name}: {k}", v) for name, entry in values.items() if isinstance(entry, dict) for k, v in entry.items()
+            (f"{name}: {k}", v)
+            for name, entry in values.items()
+            if isinstance(entry, dict)
+            for k, v in entry.items()
         ]
         rows += [(k, v) for k, v in values.items() if not isinstance(v, dict)]
         print_table(title, ("", "value"), rows)

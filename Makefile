@@ -1,0 +1,47 @@
+# Everything happens in .venv, made from the exact versions in requirements.lock.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+READY := $(VENV)/.installed
+PEERS := .venv-peers
+
+.PHONY: run test lint bench bench-peers clean
+
+run: $(READY)
+	$(BIN)/i2rl run patrol
+
+test: $(READY)
+	$(BIN)/pytest -n 2 --dist loadfile -q tests
+
+lint: $(READY)
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	@mkdir -p build/lint && ln -sfn "$(CURDIR)" build/lint/i2rl
+	MYPYPATH=build/lint $(BIN)/mypy --config-file pyproject.toml -p i2rl.models -p i2rl.inference -p i2rl.domains -p i2rl.analysis
+
+bench: $(READY)
+	$(BIN)/python -m i2rl.analysis.benchmarks.sessions
+	$(BIN)/python -m i2rl.analysis.benchmarks.accuracy
+	$(BIN)/python -m i2rl.analysis.benchmarks.planning
+	$(BIN)/python -m i2rl.analysis.benchmarks.posterior
+	$(BIN)/python -m i2rl.analysis.benchmarks.calibration
+	$(BIN)/python -m i2rl.analysis.benchmarks.kills
+
+bench-peers: $(READY) $(PEERS)/.installed
+	$(BIN)/python -m i2rl.analysis.benchmarks.peers --peer-python $(PEERS)/bin/python
+
+$(READY): requirements.lock pyproject.toml
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.lock
+	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps -e .
+	@touch $@
+
+# The peer needs its own environment: it pins old versions, and its tools need an old setuptools.
+$(PEERS)/.installed:
+	$(PYTHON) -m venv $(PEERS)
+	$(PEERS)/bin/pip install --quiet --disable-pip-version-check torch==2.13.0
+	$(PEERS)/bin/pip install --quiet --disable-pip-version-check imitation==1.0.1 "setuptools<81"
+	@touch $@
+
+clean:
+	rm -rf $(VENV) $(PEERS) build report
