@@ -1,0 +1,228 @@
+"""Learning bout by bout from simulated mice: prediction before learning, baselines, figures."""
+
+from __future__ import annotations
+
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from i2rl.analysis.labyrinth import (
+    bits_per_decision,
+    predict_with_learner,
+    predict_with_table,
+    predict_with_tables,
+    report,
+    study,
+    summary,
+    tables,
+)
+from i2rl.analysis.labyrinth_figures import maze_layout, values_by_node
+from i2rl.domains.labyrinth import (
+    FIRST_END,
+    HOME,
+    N_NODES,
+    WATER_PORT,
+    Bout,
+    demonstration_of,
+    labyrinth,
+    parent_of,
+    simulate_bouts,
+)
+from i2rl.models.planning import reward_of, soft_plan
+
+DISCOUNT = 0.6
+MAZE = labyrinth(DISCOUNT)
+NOTHING = np.zeros(MAZE.mdp.n_states, bool)
+
+
+def thirsty_weights():
+    """A mouse that dislikes turning, explores, and climbs towards the water port."""
+    weights = dict.fromkeys(MAZE.mdp.feature_names, 0.0)
+    weights |= {"turns round": -1.5, "goes deeper": 0.7, "reaches home": 1.0, "reaches the water port": 2.0}
+    node = parent_of(WATER_PORT)
+    while node:
+        weights[f"reaches {node}"] = 1.2
+        node = parent_of(node)
+    return np.array(list(weights.values()))
+
+
+@pytest.fixture(scope="module")
+def mouse():
+    return simulate_bouts(jax.random.key(3), MAZE, thirsty_weights(), 40, max_steps=128)
+
+
+@pytest.fixture(scope="module")
+def result(mouse):
+    return study(mouse, recording="a simulated mouse", discount=DISCOUNT, ridge=2.0)
+
+
+def score(result, method, view=0):
+    (p,) = (p for p in result.views[view].predictions if p.method == method)
+    return p.bits.sum() / result.decisions.sum()
+
+
+def true_bits(mouse):
+    log_policy = np.asarray(soft_plan(MAZE.mdp, reward_of(MAZE.mdp, thirsty_weights())).log_policy)
+    demonstration = demonstration_of(MAZE, mouse)
+    lengths = -log_policy[demonstration.state, demonstration.action] / np.log(2)
+    return np.where(demonstration.kind > 0, lengths, 0).sum() / demonstration.lengths.sum()
+
+
+def test_the_learner_predicts_a_simulated_mouse_better_than_every_baseline(result, mouse):
+    learner = score(result, "i2rl")
+    baselines = ("uniform", "frequencies", "given entry", "level and entry", "Markov")
+    assert learner < min(score(result, name) for name in baselines) - 0.02
+    assert true_bits(mouse) < learner < true_bits(mouse) + 0.15
+
+
+def test_the_learner_recovers_the_policy_where_the_mouse_has_been(result, mouse):
+    view = result.views[0]
+    true = np.exp(soft_plan(MAZE.mdp, reward_of(MAZE.mdp, thirsty_weights())).log_policy)
+    learned = np.exp(soft_plan(MAZE.mdp, reward_of(MAZE.mdp, view.learned.weights)).log_policy)
+    demonstration = demonstration_of(MAZE, mouse)
+    visits = np.bincount(demonstration.state[demonstration.kind > 0], minlength=MAZE.mdp.n_states)
+    uniform = np.asarray(MAZE.mdp.available) / np.asarray(MAZE.mdp.available).sum(1, keepdims=True)
+    distance = {n: 0.5 * np.abs(p - true).sum(1) @ visits for n, p in (("learned", learned), ("no", uniform))}
+    assert distance["learned"] < 0.3 * distance["no"]
+
+
+def test_bits_of_a_bout_depend_on_earlier_bouts_only(mouse):
+    demonstration = demonstration_of(MAZE, mouse[:6])
+    changed = demonstration_of(MAZE, [*mouse[:4], *mouse[10:12]]).padded(6, 128)
+    rows = demonstration.padded(6, 128)
+
+    def all_methods(demo):
+        learner, _ = predict_with_learner(MAZE, demo, NOTHING, 2.0)
+        return np.array([p.bits for p in (learner, *predict_with_tables(MAZE, demo, NOTHING))])
+
+    before, after = all_methods(rows), all_methods(changed)
+    np.testing.assert_array_equal(before[:, :4], after[:, :4])
+    assert (before[1:, 4:] != after[1:, 4:]).any()
+
+
+def test_the_first_bout_is_predicted_from_the_prior(mouse):
+    learner, _ = predict_with_learner(MAZE, demonstration_of(MAZE, mouse[:1]).padded(1, 128), NOTHING, 2.0)
+    prior = np.asarray(soft_plan(MAZE.mdp, reward_of(MAZE.mdp, np.zeros(133))).log_policy)
+    demonstration = demonstration_of(MAZE, mouse[:1])
+    expected = -prior[demonstration.state, demonstration.action].sum() / np.log(2)
+    assert learner.bits[0] == pytest.approx(expected, rel=1e-9)
+
+
+def test_uniform_costs_log_3_at_junctions_and_nothing_at_ends(result, mouse):
+    at_junctions = sum(n < FIRST_END for b in mouse for n in b.nodes[:-1])
+    assert score(result, "uniform") == pytest.approx(at_junctions * np.log2(3) / result.decisions.sum())
+
+
+def test_tables_agree_with_hand_computation():
+    # Two bouts: down to the left and back home; then straight home.
+    bouts = [Bout(None, (0, 1, 0, HOME)), Bout(None, (0, HOME))]
+    by_name = {p.method: p for p in predict_with_tables(MAZE, demonstration_of(MAZE, bouts), NOTHING)}
+    # Nobody learns within a bout, so the first costs three uniform choices.
+    for p in by_name.values():
+        assert p.bits[0] == pytest.approx(3 * np.log2(3))
+    # Then: one step left and two back seen in all; counts from one, back has 3 of 6.
+    assert by_name["frequencies"].bits[1] == pytest.approx(1.0)
+    # Entered from above: left once (at 0), back once (at 1); back has 2 of 5.
+    assert by_name["given entry"].bits[1] == pytest.approx(np.log2(5 / 2))
+    # At level 0 from above, and at node 0 from above: left once; back has 1 of 4.
+    assert by_name["level and entry"].bits[1] == pytest.approx(2.0)
+    assert by_name["Markov"].bits[1] == pytest.approx(2.0)
+    assert {n: p.parameters for n, p in by_name.items()} == {
+        "uniform": 0, "frequencies": 2, "frequencies of choices": 2, "given entry": 6, "level and entry": 36,
+        "Markov": 378,
+    }  # fmt: skip
+
+
+def test_forced_steps_teach_frequencies_but_not_frequencies_of_choices():
+    end = 63
+    down = [0, 1, 3, 7, 15, 31, end]
+    bouts = [Bout(None, (*down, *reversed(down[:-1]), HOME)), Bout(None, (0, HOME))]
+    by_name = {p.method: p for p in predict_with_tables(MAZE, demonstration_of(MAZE, bouts), NOTHING)}
+    # Six steps left and seven back, one of them forced.
+    assert by_name["frequencies"].bits[1] == pytest.approx(np.log2(16 / 8))
+    assert by_name["frequencies of choices"].bits[1] == pytest.approx(np.log2(15 / 7))
+
+
+def test_tables_learn_only_from_what_is_in_view():
+    bouts = [Bout(None, (0, 1, 0, HOME)), Bout(None, (0, 1, 0, HOME))]
+    hidden = MAZE.below(1)
+    p = predict_with_table(
+        MAZE, demonstration_of(MAZE, bouts), hidden, "pooled", np.zeros(MAZE.mdp.n_states, int), MAZE.choice
+    )
+    # In view: left at 0, back (home) at 0. So left and back have 2 of 5 each; node 1's step is out of view.
+    assert p.bits[1] == pytest.approx(3 * np.log2(5 / 2))
+    assert p.bits_out_of_view.tolist() == pytest.approx([np.log2(3), np.log2(5 / 2)])
+
+
+def test_the_learner_never_hears_what_happened_out_of_view():
+    hidden = MAZE.below(1)
+    last = (0, 1, 4, 9, 4, 1, 0, 2, 0, HOME)
+    one, other = (
+        predict_with_learner(
+            MAZE, demonstration_of(MAZE, [Bout(None, first), Bout(None, last)]).padded(2, 16), hidden, 2.0
+        )[0]
+        for first in ((0, 1, 3, 7, 3, 1, 0, HOME), (0, 1, 4, 1, 4, 1, 0, HOME))
+    )
+    assert one.bits[0] != other.bits[0]
+    assert one.bits[1] == other.bits[1]
+
+
+def test_with_half_of_the_maze_hidden_learning_goes_on_and_the_markov_chain_knows_nothing_there(result):
+    assert score(result, "i2rl", 1) < score(result, "uniform", 1) - 0.02
+    view = result.views[1]
+    markov = next(p for p in view.predictions if p.method == "Markov")
+    uniform = next(p for p in view.predictions if p.method == "uniform")
+    np.testing.assert_allclose(markov.bits_out_of_view, uniform.bits_out_of_view)
+    assert view.decisions_out_of_view.sum() > 100
+    assert result.views[0].decisions_out_of_view.sum() == 0
+
+
+def test_intervals_hold_the_estimate_and_vanish_for_equal_bouts():
+    constant = bits_per_decision(np.full(9, 6.0), np.full(9, 4))
+    assert tuple(constant) == pytest.approx((1.5, 1.5, 1.5))
+    varied = bits_per_decision(np.array([1.0, 9.0, 2.0, 8.0]), np.full(4, 5))
+    assert varied.estimate == pytest.approx(1.0)
+    assert varied.low < varied.estimate < varied.high
+
+
+def test_an_empty_recording_is_refused():
+    with pytest.raises(ValueError, match="no bouts"):
+        study([])
+
+
+def test_the_report_holds_figures_in_both_themes_and_every_number(result, tmp_path):
+    paths = report(result, tmp_path / "new")
+    names = ["bits-light.png", "bits-dark.png", "value-light.png", "value-dark.png", "study.json"]
+    assert [p.name for p in paths] == names
+    assert all(p.read_bytes().startswith(b"\x89PNG") for p in paths[:-1])
+    content = json.loads(paths[-1].read_text())
+    assert content == json.loads(json.dumps(summary(result)))
+    methods = content["views"]["whole maze"]["methods"]
+    assert methods["i2rl"]["bits_per_decision"]["estimate"] == pytest.approx(score(result, "i2rl"))
+    assert sum(methods["Markov"]["bits_of_each_bout"]) == pytest.approx(
+        score(result, "Markov") * content["decisions"]
+    )
+    assert [t.row_count for t in tables(result)] == [8, 7]
+
+
+def test_the_maze_is_drawn_without_two_nodes_in_one_place_and_children_beside_their_parent():
+    position = maze_layout()
+    assert len({tuple(p) for p in position}) == N_NODES + 1
+    for node in range(1, N_NODES):
+        assert (position[node] == position[parent_of(node)]).sum() == 1
+    assert {tuple(p) for p in position[FIRST_END:N_NODES]} == {
+        (x, y) for x in range(-7, 8, 2) for y in range(-7, 8, 2)
+    }
+    left_of_heading = position[1] - position[0]
+    assert left_of_heading[1] > 0
+
+
+def test_the_value_drawn_at_the_water_port_holds_the_reward_of_reaching_it():
+    weights = thirsty_weights()
+    values = np.asarray(soft_plan(MAZE.mdp, reward_of(MAZE.mdp, weights)).values)
+    drawn = values_by_node(MAZE, weights, values)
+    at_port = values[np.flatnonzero(MAZE.node == WATER_PORT)[0]]
+    assert drawn[WATER_PORT] == pytest.approx(2.0 + 0.7 + DISCOUNT * at_port)
+    assert np.flatnonzero(np.isnan(drawn)).tolist() == [0]
