@@ -5,9 +5,11 @@ Heavy modules are imported inside the commands, so that ``--help`` answers at on
 
 from __future__ import annotations
 
+import _thread
 import json
 import os
 import sys
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from enum import StrEnum
@@ -17,6 +19,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from ..models.evidence import Imperfection
     from ..models.mdp import TabularMDP
 
@@ -48,17 +52,22 @@ Instance = Annotated[int, typer.Option(min=1, max=3, help="Patrol instance (1, 2
 Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same result.")]
 
 
-@app.callback()
-def _version(
-    version: Annotated[
-        bool, typer.Option("--version", help="Print the version and exit.", is_eager=True)
-    ] = False,
-) -> None:
-    if version:
+def _print_version(wanted: bool) -> None:
+    if wanted:
         from ..version import __version__
 
         print(__version__)
         raise typer.Exit
+
+
+@app.callback()
+def _options(
+    version: Annotated[
+        bool,
+        typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version and exit."),
+    ] = False,
+) -> None:
+    pass
 
 
 # -- run ----------------------------------------------------------------------------------------------
@@ -91,8 +100,47 @@ def run_patrol(
     if as_json:
         print(json.dumps(patrol_study.summary(study)))
     else:
-        patrol_study.print_table(study)
+        patrol_study.print_table(study, _console())
         print(f"Report: {report / 'index.html'}")
+
+
+@run.command("labyrinth")
+def run_labyrinth(
+    recording: Annotated[
+        Path, typer.Option(help="JSON Lines file of bouts, each with its sequence of nodes.")
+    ],
+    hide_left: Annotated[
+        bool, typer.Option(help="Learn also with the left half of the maze out of view.")
+    ] = True,
+    discount: Annotated[
+        float | None, typer.Option(min=0, max=1, help="Discount of the animal's future.")
+    ] = None,
+    ridge: Annotated[
+        float | None, typer.Option(min=0, help="Precision of the weights' Gaussian prior.")
+    ] = None,
+    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-labyrinth"),
+    as_json: Json = False,
+) -> None:
+    """Learn a mouse's reward in a labyrinth, bout by bout, each bout predicted before it is learned from."""
+    from ..domains.labyrinth import read_bouts
+    from . import labyrinth
+
+    with _reported_errors(), _progress(as_json) as advance:
+        with recording.open(encoding="utf-8") as lines:
+            bouts = list(read_bouts(lines, recording.name))
+        study = labyrinth.study(
+            bouts, recording=recording.stem, hide_left=hide_left,
+            discount=labyrinth.DISCOUNT if discount is None else discount,
+            ridge=labyrinth.RIDGE if ridge is None else ridge,
+            on_bout=lambda view, number, bits: advance(f"{view}: bout {number}, {bits:.3f} bits", None),
+        )  # fmt: skip
+        labyrinth.report(study, report)
+    if as_json:
+        print(json.dumps(labyrinth.summary(study)))
+        return
+    for table in labyrinth.tables(study):
+        _console().print(table)
+    print(f"Report: {report}")
 
 
 # -- simulate -----------------------------------------------------------------------------------------
@@ -166,6 +214,8 @@ def learn(
             process, sensor, statistic=statistic, solver=solver, ridge=ridge,
             slack=DEFAULT_SLACK if slack is None else slack,
         )  # fmt: skip
+        if agent is not None:  # another agent is another expert, so the journal must not go on with its lines
+            learner = learner._replace(configuration={**learner.configuration, "agent": agent})
         lines, source = open_lines(demos, follow)
         with Journal.open(journal, learner) as opened, _progress(as_json) as advance:
             before = opened.session
@@ -249,18 +299,23 @@ def _decision_process(name: str, observability: int | None) -> tuple[TabularMDP,
 def _reported_errors() -> Iterator[None]:
     """Mistakes in what was given end with one clear line, not a traceback."""
     from ..inference.journal import JournalError
+    from ..inference.maxent_constraints import ProgramNotSolved
 
     try:
         yield
-    except (ValueError, JournalError, FileNotFoundError, IsADirectoryError, PermissionError) as error:
-        if os.environ.get("I2RL_TRACEBACK"):
-            raise
-        _say(f"Error: {error}")
-        raise typer.Exit(1) from None
+        sys.stdout.flush()  # not left to the interpreter's exit, which would complain of a reader that left
     except BrokenPipeError:
         # The reader of our output (head, say) has had enough; Python must not complain at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         raise typer.Exit(0) from None
+    except (ValueError, OSError, JournalError, ProgramNotSolved) as error:
+        if os.environ.get("I2RL_TRACEBACK"):
+            raise
+        message = str(error)
+        if isinstance(error, OSError) and error.filename is not None:
+            message = f"{error.filename}: {error.strerror}"
+        _say(f"Error: {message}")
+        raise typer.Exit(1) from None
 
 
 @contextmanager
@@ -283,6 +338,21 @@ def _progress(quiet: bool) -> Iterator[Any]:
         yield advance
 
 
+def _interrupt_again(unraisable: Any) -> None:
+    """Raise Ctrl-C once more where Python swallowed it: in JAX's callback of the garbage collector."""
+    if unraisable.exc_type is KeyboardInterrupt:
+        threading.Timer(0.01, _thread.interrupt_main).start()
+    else:
+        sys.__unraisablehook__(unraisable)
+
+
+def _console() -> Console:
+    """Tables fit the terminal, and are not squeezed where there is none."""
+    from rich.console import Console
+
+    return Console(width=None if sys.stdout.isatty() else 120)
+
+
 def _say(text: str) -> None:
     print(text, file=sys.stderr)
 
@@ -300,7 +370,6 @@ def _print_weights(mdp: TabularMDP, state: Any) -> None:
     if state is None:
         return
     import numpy as np
-    from rich.console import Console
     from rich.table import Table
 
     weights = np.asarray(state.weights)
@@ -311,15 +380,14 @@ def _print_weights(mdp: TabularMDP, state: Any) -> None:
     scale = max(float(np.abs(weights).sum()), 1e-300)
     for name, weight in zip(mdp.feature_names, weights, strict=True):
         table.add_row(name, f"{weight:.3f}", f"{weight / scale:.3f}")
-    Console().print(table)
+    _console().print(table)
 
 
 def _print_history(view: Any, records: list[Any], last: int) -> None:
-    from rich.console import Console
     from rich.table import Table
 
     origin = view.origin
-    console = Console()
+    console = _console()
     console.print(f"{origin.method} on an MDP of {origin.n_states} states and {origin.n_actions} actions; "
                   f"{len(records)} sessions")  # fmt: skip
     if not records:
@@ -345,6 +413,7 @@ def _print_history(view: Any, records: list[Any], last: int) -> None:
 
 def main() -> None:
     """Entry point of the ``i2rl`` command."""
+    sys.unraisablehook = _interrupt_again
     app()
 
 

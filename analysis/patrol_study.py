@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Float
+from rich.console import Console
 
 from ..domains.breach_trials import REACHED, TIMED_OUT, BreachOutcome, breach_trials, greedy_policies
 from ..domains.patrol import Patrol, demonstrate, instance, simulate_patrol
@@ -345,9 +346,8 @@ _CAPTION = (
 )
 
 
-def print_table(study: Study) -> None:
+def print_table(study: Study, console: Console) -> None:
     """Print the results."""
-    from rich.console import Console
     from rich.table import Table as RichTable
 
     table = RichTable(title=_title(study), caption=_CAPTION, caption_justify="left")
@@ -355,7 +355,7 @@ def print_table(study: Study) -> None:
         table.add_column(heading, justify="left" if i == 0 else "right")
     for row in _cells(study):
         table.add_row(*row)
-    Console().print(table)
+    console.print(table)
 
 
 def _title(study: Study) -> str:

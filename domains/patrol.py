@@ -373,6 +373,10 @@ def boyd_with_rooms() -> Patrol:
 
     The turning feature fires on left turns in the hallways only, as in the released code (the dissertation
     says any turn). The learner's start, (0,17) facing west, is a reconstruction.
+
+    Two limits on what can be learned here. The features span a potential-based shaping (potential: being in
+    a room), so one direction of weights changes no behaviour and no data identifies it. And the patrollers
+    never enter a room, so what they would do inside, 56 of the 184 states, is known only by extrapolation.
     """
     first_room = [(r, 10) for r in range(1, 6)] + [(2, c) for c in range(4, 10)]
     second_room = [(5, c) for c in range(13, 16)]
