@@ -5,9 +5,9 @@ Heavy modules are imported inside the commands, so that ``--help`` answers at on
 
 from __future__ import annotations
 
-import _thread
 import json
 import os
+import signal
 import sys
 import threading
 from collections.abc import Iterator
@@ -341,7 +341,8 @@ def _progress(quiet: bool) -> Iterator[Any]:
 def _interrupt_again(unraisable: Any) -> None:
     """Raise Ctrl-C once more where Python swallowed it: in JAX's callback of the garbage collector."""
     if unraisable.exc_type is KeyboardInterrupt:
-        threading.Timer(0.01, _thread.interrupt_main).start()
+        main_thread = threading.main_thread().ident
+        threading.Timer(0.01, signal.pthread_kill, (main_thread, signal.SIGINT)).start()
     else:
         sys.__unraisablehook__(unraisable)
 
