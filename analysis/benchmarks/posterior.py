@@ -36,7 +36,7 @@ def main() -> None:
             rows.append({
                 "seed": seed, "patroller": patroller, "R-hat": float(summary["r_hat"].max()),
                 "bulk ESS": float(summary["ess_bulk"].min()), "tail ESS": float(summary["ess_tail"].min()),
-                "divergences": int(data.sample_stats["diverging"].sum()), "seconds": spent,
+                "divergences": int(data["sample_stats"]["diverging"].sum()), "seconds": spent,
             })  # fmt: skip
     print_table(
         f"NUTS, patrol 2, {options.fragments} fragments (worst weight)",
