@@ -214,8 +214,12 @@ def learn(
             process, sensor, statistic=statistic, solver=solver, ridge=ridge,
             slack=DEFAULT_SLACK if slack is None else slack,
         )  # fmt: skip
-        if agent is not None:  # another agent is another expert, so the journal must not go on with its lines
-            learner = learner._replace(configuration={**learner.configuration, "agent": agent})
+        # Another agent is another expert, and other sessions are another history: a journal of one must
+        # not go on with the other.
+        stream = ({} if agent is None else {"agent": agent}) | (
+            {} if session_size == 1 else {"session_size": session_size}
+        )
+        learner = learner._replace(configuration={**learner.configuration, **stream})
         lines, source = open_lines(demos, follow)
         with Journal.open(journal, learner) as opened, _progress(as_json) as advance:
             before = opened.session

@@ -284,6 +284,7 @@ def test_a_broken_line_is_told_and_the_sessions_before_it_are_kept(house):
         ({"statistic": "counts"}, r"statistic \(seen there, counts here\)"),
         ({"slack": 0.5}, r"slack \(0.002 there, 0.5 here\)"),
         ({"agent": 1}, r"agent \(0 there, 1 here\)"),
+        ({"session_size": 2}, r"session_size"),
         ({"mdp": "other.npz"}, "MDP"),
     ],
 )

@@ -51,8 +51,10 @@ def test_all_three_programs_agree_under_slack(problem):
     mdp, _, target = problem
     slack = 0.002 / (1 - float(mdp.discount))
     solutions = [
-        solve_dual(mdp, target, slack), DualProgram(mdp).solve(target, slack), PrimalProgram(mdp).solve(target, slack),
-    ]  # fmt: skip
+        solve_dual(mdp, target, slack),
+        DualProgram(mdp).solve(target, slack),
+        PrimalProgram(mdp).solve(target, slack),
+    ]
     for solution in solutions[1:]:
         assert np.allclose(solution.weights, solutions[0].weights, atol=1e-4)
     objectives = [float(s.objective) for s in solutions]
