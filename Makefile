@@ -31,6 +31,7 @@ bench-peers: $(READY) $(PEERS)/.installed
 	$(BIN)/python -m i2rl.analysis.benchmarks.peers --peer-python $(PEERS)/bin/python
 
 $(READY): requirements.lock pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "i2rl needs Python 3.11 or later: make PYTHON=python3.11 ...")'
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.lock
 	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps -e .
@@ -44,4 +45,4 @@ $(PEERS)/.installed:
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(PEERS) build report
+	rm -rf $(VENV) $(PEERS) build report report-labyrinth

@@ -6,6 +6,7 @@ Heavy modules are imported inside the commands, so that ``--help`` answers at on
 from __future__ import annotations
 
 import json
+import math
 import os
 import signal
 import sys
@@ -363,12 +364,14 @@ def _say(text: str) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """Arrays and tuples as JSON takes them."""
+    """Arrays and tuples as JSON takes them; what is no number becomes null."""
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
     if isinstance(value, dict):
         return {k: _plain(v) for k, v in value.items()}
     if isinstance(value, tuple | list):
         return [_plain(v) for v in value]
-    return value.tolist() if hasattr(value, "tolist") else value
+    return _plain(value.tolist()) if hasattr(value, "tolist") else value
 
 
 def _print_weights(mdp: TabularMDP, state: Any) -> None:

@@ -342,7 +342,8 @@ def _cells(study: Study) -> list[tuple[str, ...]]:
 
 _CAPTION = (
     "Medians over runs and patrollers. LBA: learned behaviour accuracy. ILE: inverse learning error "
-    "relative to the optimal value. Batch: seconds of one run over everything, spent again at each session."
+    "relative to the optimal value. Seconds: all patrollers together; for batch, those of one run over "
+    "everything, spent again at each session."
 )
 
 
@@ -374,7 +375,7 @@ def write(study: Study, folder: Path | str) -> Path:
         (
             "policy", lambda theme: policy_map(
                 study.patrol, np.exp(np.asarray(policy)), study.observability, theme=theme,
-                title=f"Policy learned by {first.name}",
+                title=f"Policy of {first.name}",
             ),
             "What the first patroller is believed to do in every state; tinted cells are in view.",
             "Map of the patrol with the learned policy as arrows",
@@ -406,7 +407,9 @@ def write(study: Study, folder: Path | str) -> Path:
             )
         drawings.append((
             "time", lambda theme: learning_time(times, theme=theme),
-            "Cumulative learning time, compilation excluded.", "Learning time against trajectories",
+            "Learning time of all patrollers together, without compilation. Batch was timed at three points; "
+            "running it after every session is summed by interpolation between them.",
+            "Learning time against trajectories",
         ))  # fmt: skip
     breached = [m for m in study.methods if m.breach is not None]
     if breached:

@@ -69,7 +69,7 @@ class _Iterate(NamedTuple):
     weights: Float[Array, " K"]
     values: Float[Array, " S"]
     change: Float[Array, ""]
-    residual: Float[Array, ""]
+    gradient: Float[Array, ""]
     iterations: Int[Array, ""]
     solver_iterations: Int[Array, ""]
     key: Array
@@ -92,10 +92,22 @@ class _Method(NamedTuple):
         posterior = self.completion(key, self.mdp, plan.log_policy, evidence)
         return complete(self.mdp, posterior, evidence.live, seen)
 
-    def working(self, kept: Any, key: Array, plan: SoftPlan, evidence: Evidence, seen: Array) -> Any:
-        """What the M-step fits: the carried statistic and the current session, completed under ``plan``."""
+    def working(self, kept: Any, key: Array, plan: SoftPlan, evidence: Evidence, seen: Array) -> tuple:
+        """What the M-step fits, and the session's exact log-likelihood under ``plan``.
+
+        It fits the carried statistic and the current session, completed under ``plan``.
+        """
         completed = self.e_step(key, plan, evidence, seen)
-        return blend(kept, self.statistic.of_session(self.mdp, plan, completed))
+        working = blend(kept, self.statistic.of_session(self.mdp, plan, completed))
+        return working, jnp.sum(completed.expectations.log_likelihood)
+
+    def gradient(self, weights: Float[Array, " K"], values: Float[Array, " S"], working: Any) -> Array:
+        """Norm of the log-likelihood's gradient; ``|phi_hat - E[phi]|`` with the ``features`` statistic."""
+
+        def likelihood(w: Float[Array, " K"]) -> Float[Array, ""]:
+            return self.statistic.log_likelihood(self.mdp, w, self.plan(w, values).values, working)
+
+        return jnp.linalg.norm(jax.grad(likelihood)(weights))
 
     def penalties(self, statistic: Any) -> tuple:
         """Slack of the program, and the prior's precision per trajectory."""
@@ -136,7 +148,8 @@ def lme_i2rl(
         Relaxation ``epsilon`` of the matching constraint: an L1 penalty of ``slack`` nats per trajectory
         (``slack / (1 - gamma)`` with the ``features`` statistic, as in Theorem 1).
     ridge : float
-        Precision of a Gaussian prior on the weights (nats in all, not per trajectory).
+        Precision of a Gaussian prior on the weights (nats in all, not per trajectory); for the newton and
+        ipopt solvers.
     iterations, tolerance : int, float
         A session ends after so many E- and M-steps, or when no weight moves by more than ``tolerance``
         relative to the largest.
@@ -182,7 +195,10 @@ def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: Imperfection, **option
 
 
 def me_i2rl(mdp: TabularMDP, **options: Any) -> Learner:
-    """Online maximum-entropy IRL under full observability (Theorem 1); options as for :func:`lme_i2rl`."""
+    """Online maximum-entropy IRL under full observability; options as for :func:`lme_i2rl`.
+
+    Theorem 1 is about the program that ``statistic="features"`` solves.
+    """
     return lme_i2rl(mdp, Sensor(), name="ME-I2RL", **options)
 
 
@@ -203,6 +219,8 @@ def _method(
         raise ValueError(f"statistic must be one of {', '.join(STATISTICS)}, got {statistic!r}")
     if completion != "exact" and completion not in samplers:
         raise ValueError(f"completion must be exact, blocked or gibbs, got {completion!r}")
+    if completion != "exact" and draws < 1:
+        raise ValueError(f"a sampled completion needs at least one draw, got {draws}")
     if not slack >= 0 or not ridge >= 0:
         raise ValueError(f"slack and ridge must not be negative, got {slack} and {ridge}")
 
@@ -265,12 +283,17 @@ def _em(
     def step(point: _Iterate) -> _Iterate:
         key, sample = jax.random.split(point.key)
         plan = method.plan(point.weights, point.values)
-        working = method.working(kept, sample, plan, evidence, seen)
+        working, _ = method.working(kept, sample, plan, evidence, seen)
         solution = m_step(
             method.mdp, working, *method.penalties(working), WarmStart(point.weights, plan.values)
         )
+        gradient = lax.cond(
+            point.iterations == 0,
+            lambda: method.gradient(point.weights, plan.values, working),
+            lambda: point.gradient,
+        )
         return _Iterate(
-            solution.weights, solution.values, _change(point.weights, solution.weights), solution.residual,
+            solution.weights, solution.values, _change(point.weights, solution.weights), gradient,
             point.iterations + 1, point.solver_iterations + solution.iterations, key,
         )  # fmt: skip
 
@@ -301,20 +324,22 @@ def _close(
     completed = method.e_step(sample, plan, evidence, seen)
     new = statistic.to_keep(mdp, plan, completed)
     own = jnp.sum(completed.expectations.log_likelihood)
-    carried = statistic.log_likelihood(mdp, point.weights, plan.values, state.statistic)
-    size = state.statistic.size + new.size
+    kept = blend(state.statistic, new)
     fields: dict[str, Any] = {
         "session": state.session + 1,
-        "log_likelihood": (own + carried * state.statistic.size) / jnp.maximum(size, 1.0),
+        "log_likelihood": statistic.log_likelihood(mdp, point.weights, plan.values, kept),
         "demonstration_log_likelihood": own,
-        "residual": point.residual,
+        "gradient": point.gradient,
         "iterations": point.iterations,
         "solver_iterations": point.solver_iterations,
         "seconds": jnp.array(jnp.nan),
         "weights": point.weights,
     }
-    kept = blend(state.statistic, new)
-    return LMEState(point.weights, kept, plan.values, program, state.session + 1, key), Report(**fields)
+    learned = LMEState(point.weights, kept, plan.values, program, state.session + 1, key)
+    # An observation that cannot be must not spoil what was learned (a fleet raises nothing).
+    possible = jnp.isfinite(own)
+    state = jax.tree.map(partial(jnp.where, possible), learned, state._replace(program=program))
+    return state, Report(**fields)
 
 
 def _learner(
@@ -330,8 +355,13 @@ def _learner(
     in_jax = {"newton": _newton, "exponentiated gradient": _exponentiated}
     if solver not in (*in_jax, "ipopt", "cvxpy"):
         raise ValueError(f"solver must be newton, ipopt, cvxpy or exponentiated gradient, got {solver!r}")
-    if solver in ("cvxpy", "exponentiated gradient") and method.statistic.name != "features":
-        raise ValueError(f"the {solver} solver needs the features statistic, not {method.statistic.name}")
+    if solver in ("cvxpy", "exponentiated gradient"):
+        if method.statistic.name != "features":
+            raise ValueError(f"the {solver} solver needs the features statistic, not {method.statistic.name}")
+        if method.ridge > 0:
+            raise ValueError(f"the {solver} solver has no ridge: use newton or ipopt with a prior")
+    if iterations < 1:
+        raise ValueError(f"a session needs at least one iteration, got {iterations}")
 
     def begin(state: LMEState, demonstration: Demonstration) -> tuple:
         evidence = evidence_of(mdp, method.sensor, demonstration)
@@ -373,21 +403,26 @@ def _learner(
         ) -> tuple:
             key, sample = jax.random.split(key)
             plan = method.plan(weights, values)
-            working = method.working(kept, sample, plan, evidence, seen)
-            return key, plan.values, working, *method.penalties(working)
+            working, own = method.working(kept, sample, plan, evidence, seen)
+            gradient = method.gradient(weights, plan.values, working)
+            return key, plan.values, own, gradient, working, *method.penalties(working)
 
         def run(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
             evidence, seen, key, weights, values = opening(state, demonstration)
             program, total, steps, change = state.program, 0, 0, np.inf
+            first = jnp.array(jnp.nan)
             while steps < iterations and change > tolerance:
-                key, values, working, slack, ridge = expectation(
+                key, values, own, gradient, working, slack, ridge = expectation(
                     state.statistic, key, weights, values, evidence, seen
                 )
+                if not np.isfinite(own):  # no program to solve: update says which step cannot be
+                    break
+                first = gradient if steps == 0 else first
                 solution, program = solve(working, slack, ridge, program)
                 change = float(_change(weights, jnp.asarray(solution.weights)))
                 weights, values = jnp.asarray(solution.weights), jnp.asarray(solution.values)
                 total, steps = total + int(solution.iterations), steps + 1
-            counted = (jnp.array(change), jnp.array(jnp.nan), jnp.array(steps), jnp.array(total))
+            counted = (jnp.array(change), first, jnp.array(steps), jnp.array(total))
             point = _Iterate(weights, values, *counted, key)
             return closing(state, point, program, evidence, seen)
 
@@ -405,6 +440,8 @@ def _learner(
 
     def update(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
         began = time.perf_counter()
+        if not demonstration.lengths.any():
+            raise DemonstrationError("a session needs at least one trajectory with a step")
         new, report = run(state, demonstration.bucketed())
         if not np.isfinite(report.demonstration_log_likelihood):
             require_possible(method.sensor, mdp, demonstration)
@@ -413,7 +450,17 @@ def _learner(
         values: dict[str, Any] = {name: x if x.ndim else x.item() for name, x in arrays.items()}
         return new, Report(**values)._replace(seconds=time.perf_counter() - began)
 
-    return Learner(name, mdp, configuration, init, update, session if solver in in_jax else None)
+    @jax.jit
+    def likelihood(state: LMEState, weights: Float[Array, " K"]) -> Float[Array, ""]:
+        values = method.plan(weights, state.values).values
+        return method.statistic.log_likelihood(mdp, weights, values, state.statistic)
+
+    def log_likelihood(state: LMEState, weights: Float[Array, " K"]) -> float:
+        return float(likelihood(state, jnp.asarray(weights, float)))
+
+    return Learner(
+        name, mdp, configuration, init, update, session if solver in in_jax else None, log_likelihood
+    )
 
 
 # -- batch --------------------------------------------------------------------------------------------
@@ -463,6 +510,8 @@ def batch_lme(
     model rules out.
     """
     require_discounted(mdp)
+    if restarts < 1 or iterations < 1:
+        raise ValueError(f"restarts and iterations must be at least 1, got {restarts} and {iterations}")
     method = _method(mdp, sensor, "counts", "exact", slack, ridge, 0)
 
     @jax.jit
@@ -496,6 +545,8 @@ def batch_lme(
         return lax.map(from_start, jax.random.split(key, restarts))
 
     def checked(key: Array, demonstration: Demonstration) -> BatchFit:
+        if not demonstration.lengths.any():
+            raise DemonstrationError("batch learning needs at least one trajectory with a step")
         weights, average, objective, steps = (np.asarray(x) for x in fit(key, demonstration.bucketed()))
         if not np.isfinite(objective).any():
             require_possible(sensor, mdp, demonstration)

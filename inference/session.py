@@ -34,13 +34,15 @@ class Report(NamedTuple):
     session : int
         Its number, from 1.
     log_likelihood : float
-        ``LL(theta^i | X_i, statistic)`` in nats per trajectory: the session's demonstration and what the
-        statistic carries, under the new weights.
+        ``LL(theta^i | X_i, statistic)`` in nats per trajectory: what the statistic holds once the session is
+        in it, under the new weights. The share of the dynamics, which no weights change, is left out, so
+        that sessions compare.
     demonstration_log_likelihood : float
-        Exact log-likelihood (nats, hidden steps summed out) of this session's demonstration alone.
-    residual : float
-        Violation of the last program's optimality conditions, in units of the features; NaN from solvers
-        outside JAX, which raise instead.
+        Exact log-likelihood (nats, hidden steps summed out, dynamics included) of this session's
+        demonstration alone.
+    gradient : float
+        Norm of the log-likelihood's gradient at the weights the session began with: how far this session's
+        data disagree with them. ``|phi_hat - E[phi]|`` (line 15 of Algorithm 1) with the features statistic.
     iterations : int
         E- and M-steps.
     solver_iterations : int
@@ -54,7 +56,7 @@ class Report(NamedTuple):
     session: int
     log_likelihood: float
     demonstration_log_likelihood: float
-    residual: float
+    gradient: float
     iterations: int
     solver_iterations: int
     seconds: float
@@ -74,6 +76,7 @@ class Learner(NamedTuple):
     init: Callable[[Array], Any]
     update: Callable[[Any, Demonstration], tuple[Any, Report]]
     session: Callable[[Any, Demonstration], tuple[Any, Report]] | None = None
+    log_likelihood: Callable[[Any, Float[Array, " K"]], float] | None = None
 
     @property
     def signature(self) -> str:
@@ -96,7 +99,8 @@ def fleet(learner: Learner) -> Fleet:
 
     ``init(key, streams)`` and ``update(states, demonstrations)``, the arrays of a demonstration being
     ``[streams, n, L]``. Raises ``ValueError`` for a learner whose solver runs outside JAX. Observations
-    are not checked: an impossible one shows as a log-likelihood of minus infinity.
+    are not checked: an impossible one shows as a demonstration log-likelihood of minus infinity, and leaves
+    its learner's state as it was.
     """
     if learner.session is None:
         raise ValueError(
@@ -154,15 +158,19 @@ class LearningErrorChange:
         return before - after <= self.rho
 
 
-class MovingWindow(NamedTuple):
+class MovingWindow:
     """Against early stopping (chapter 4): the standard deviation over the last ``width`` sessions is small.
 
-    ``of`` names a field of the report: ``log_likelihood`` or ``residual`` (the gradient's norm).
+    ``of`` is the field of the report that must settle within ``tolerance``: ``log_likelihood`` or
+    ``gradient``. Raises ``ValueError`` for another field or a width below 2.
     """
 
-    width: int
-    tolerance: float
-    of: str = "log_likelihood"
+    def __init__(self, width: int, tolerance: float, of: str = "log_likelihood") -> None:
+        if of not in ("log_likelihood", "gradient"):
+            raise ValueError(f"a moving window is of log_likelihood or gradient, got {of!r}")
+        if width < 2:
+            raise ValueError(f"a moving window needs at least 2 sessions, got {width}")
+        self.width, self.tolerance, self.of = width, tolerance, of
 
     def __call__(self, reports: Sequence[Report]) -> bool:
         """Whether to stop after the last report."""
@@ -196,11 +204,18 @@ def run_sessions(
 
     Starts from ``state``, or where ``journal`` left off, or from ``learner.init(key)``. With a journal every
     session is committed before the next one begins; the stream must then hold only what is not yet in it.
-    ``on_session`` is called after each session. Raises ``ValueError`` if neither key, state nor a
-    journal with sessions is given, and whatever ``update`` raises (the state before it stays valid).
+    ``on_session`` is called after each session; ``stop`` sees the reports of this run. Raises ``ValueError``
+    if neither key, state nor a journal with sessions is given, for a journal of another learner or with
+    other sessions than ``state``, and whatever ``update`` raises (the state before it stays valid).
     """
-    if state is None and journal is not None:
-        state = journal.state
+    if journal is not None:
+        if journal.origin.signature != learner.signature:
+            raise ValueError(f"{journal.path} was opened for another learner than {learner.name}")
+        if state is not None and int(state.session) != journal.session:
+            raise ValueError(
+                f"the state has {int(state.session)} sessions, but {journal.path} has {journal.session}"
+            )
+        state = journal.state if state is None else state
     if state is None:
         if key is None:
             raise ValueError("run_sessions needs a key, a state or a journal to start from")
@@ -221,10 +236,13 @@ def run_sessions(
 def average_regret(
     expert: Float[np.ndarray, " T"], learned: Float[np.ndarray, " T"]
 ) -> Float[np.ndarray, " T"]:
-    """Average regret after each session (Definition 8): running mean of the log-likelihood given away.
+    """Average regret after each session: running mean of the log-likelihood given away.
 
     ``expert`` and ``learned`` are the sessions' log-likelihoods under the true weights and under the
-    learner's, ``LL(theta_E | X_i, .) - LL(theta^i | X_i, .)``. Raises ``ValueError`` if lengths differ.
+    learner's (``learner.log_likelihood(state, true_weights)`` and the reports' ``log_likelihood``). The form
+    of chapter 4, ``LL(theta_E | X_i, .) - LL(theta^i | X_i, .)``, whose two sides share their data;
+    Definition 8 prints the previous session's estimate on the previous session's data. Raises
+    ``ValueError`` if lengths differ.
     """
     expert, learned = np.asarray(expert, float), np.asarray(learned, float)
     if expert.shape != learned.shape or expert.ndim != 1:

@@ -12,7 +12,8 @@ steps that were *not* seen, and so in how much an early, poor guess at them weig
     Expected visits of the steps that were seen. Given the state, whether a step is in view says nothing
     about its action, so the conditional likelihood of the seen actions is a proper (composite) likelihood;
     the hidden steps of the current session count in full through its exact likelihood, and are then let go
-    rather than kept as a guess. With full observability it equals ``counts``.
+    rather than kept as a guess. With full observability it equals ``counts``. A noisy or partial reading is
+    kept as its posterior under the weights of its session.
 """
 
 from __future__ import annotations
@@ -109,7 +110,10 @@ class _Features:
         return epsilon / (1 - mdp.discount)
 
     def log_likelihood(self, mdp: TabularMDP, weights: Array, values: Array, kept: FeatureStatistic) -> Array:
-        """``sum_t gamma^t log pi(a_t | s_t)`` of the continued trajectories; it telescopes to this."""
+        """``sum_t gamma^t log pi(a_t | s_t)`` of the continued trajectories.
+
+        It telescopes to this in expectation over the dynamics.
+        """
         return weights @ kept.features - kept.start @ values
 
 

@@ -11,13 +11,24 @@ from i2rl.inference import (
     average_regret,
     fleet,
     lme_i2rl,
+    me_i2rl,
     run_sessions,
 )
-from i2rl.models import Demonstration, Visibility, concatenate
+from i2rl.inference.journal import Journal
+from i2rl.models import (
+    Demonstration,
+    Sensor,
+    TrajectoryLaw,
+    Visibility,
+    concatenate,
+    reward_of,
+    sample_demonstration,
+    soft_plan,
+)
 
 
-def report(session=1, log_likelihood=0.0, residual=0.0, weights=(0.0,)):
-    return Report(session, log_likelihood, log_likelihood, residual, 1, 1, 0.0, np.array(weights, float))
+def report(session=1, log_likelihood=0.0, gradient=0.0, weights=(0.0,)):
+    return Report(session, log_likelihood, log_likelihood, gradient, 1, 1, 0.0, np.array(weights, float))
 
 
 @pytest.fixture(scope="module")
@@ -58,7 +69,55 @@ def test_the_moving_window_ignores_a_pause():
     assert LikelihoodChange(0.05)(reports)
     assert not stop(reports)
     assert stop([*reports, report(4, -2.0)])
-    assert MovingWindow(2, 0.1, of="residual")([report(residual=1.0), report(residual=1.05)])
+    assert MovingWindow(2, 0.1, of="gradient")([report(gradient=1.0), report(gradient=1.05)])
+
+
+def test_a_moving_window_of_something_else_is_refused():
+    with pytest.raises(ValueError, match="log_likelihood or gradient"):
+        MovingWindow(3, 0.1, of="seconds")
+    with pytest.raises(ValueError, match="at least 2"):
+        MovingWindow(1, 0.1)
+
+
+def test_the_gradient_falls_as_sessions_agree(world):
+    mdp, _ = world
+    law = TrajectoryLaw(mdp, jnp.array([1.0, -1.0]), Sensor(), 8)
+    many = sample_demonstration(jax.random.key(0), law, 400)
+    reports = run_sessions(me_i2rl(mdp, slack=0.0), many.sessions(20), key=jax.random.key(1)).reports
+    assert reports[-1].gradient < 0.1 * reports[0].gradient
+
+
+@pytest.mark.parametrize("statistic", ["counts", "features"])
+def test_the_learners_likelihood_is_that_of_everything_it_saw(world, statistic):
+    mdp, _ = world
+    many = sample_demonstration(
+        jax.random.key(0), TrajectoryLaw(mdp, jnp.array([1.0, -1.0]), Sensor(), 8), 30
+    )
+    learner = me_i2rl(mdp, slack=0.01, statistic=statistic)
+    run = run_sessions(learner, many.sessions(10), key=jax.random.key(1))
+    weights = run.state.weights
+    assert run.reports[-1].log_likelihood == pytest.approx(learner.log_likelihood(run.state, weights))
+    if statistic == "counts":
+        log_policy = np.asarray(soft_plan(mdp, reward_of(mdp, weights)).log_policy)
+        assert run.reports[-1].log_likelihood == pytest.approx(
+            log_policy[many.state, many.action].sum(1).mean()
+        )
+    better = learner.log_likelihood(run.state, weights)
+    assert better > learner.log_likelihood(run.state, weights + 0.5)
+    assert better > learner.log_likelihood(run.state, weights - 0.5)
+
+
+def test_an_impossible_observation_leaves_a_fleets_learner_as_it_was(world):
+    mdp, sensor = world
+    many = fleet(lme_i2rl(mdp, sensor))
+    states = many.init(jax.random.key(0), 2)
+    steps = [Demonstration.from_pairs([[0]], [[1]]), Demonstration.from_pairs([[5]], [[1]])]
+    stacked = Demonstration(*(np.stack(parts) for parts in zip(*steps, strict=True)))
+    after, reports = many.update(states, stacked)
+    assert np.isfinite(reports.demonstration_log_likelihood).tolist() == [True, False]
+    assert after.session.tolist() == [1, 0]
+    assert np.array_equal(after.weights[1], states.weights[1])
+    assert np.array_equal(after.statistic.counts[1], states.statistic.counts[1])
 
 
 def test_average_regret_is_the_running_mean_of_the_likelihood_given_away():
@@ -132,3 +191,14 @@ def test_what_is_carried_does_not_grow_with_the_sessions(world, stream):
     before = [np.shape(x) for x in jax.tree.leaves(state)]
     state = run_sessions(learner, concatenate([stream, stream]).sessions(), state=state).state
     assert [np.shape(x) for x in jax.tree.leaves(state)] == before
+
+
+def test_a_journal_of_another_learner_or_of_other_sessions_is_refused(world, stream, tmp_path):
+    learner, other = lme_i2rl(*world), lme_i2rl(*world, slack=0.5)
+    with Journal.open(tmp_path / "a.db", learner) as journal:
+        run_sessions(learner, stream.select([0, 1]).sessions(), key=jax.random.key(0), journal=journal)
+        with pytest.raises(ValueError, match="another learner"):
+            run_sessions(other, stream.sessions(), key=jax.random.key(0), journal=journal)
+        fresh = learner.init(jax.random.key(0))
+        with pytest.raises(ValueError, match=r"0 sessions, but .* has 2"):
+            run_sessions(learner, stream.sessions(), state=fresh, journal=journal)

@@ -63,3 +63,20 @@ def test_a_file_that_is_no_archive_is_refused(tmp_path):
     (tmp_path / "m.npz").write_text("hello")
     with pytest.raises(ValueError, match="not an MDP archive"):
         load_mdp(tmp_path / "m.npz")
+
+
+def test_a_truncated_archive_is_refused(tmp_path):
+    path = tmp_path / "m.npz"
+    write_archive(path)
+    path.write_bytes(path.read_bytes()[:-40])
+    with pytest.raises(ValueError, match="not an MDP archive"):
+        load_mdp(path)
+
+
+@pytest.mark.parametrize(
+    "change", [{"discount": np.ones(2)}, {"states": np.array("a")}, {"in_view": [np.nan, 1]}]
+)
+def test_arrays_of_the_wrong_kind_name_the_file(tmp_path, change):
+    write_archive(tmp_path / "world.npz", **change)
+    with pytest.raises(ValueError, match=r"world\.npz"):
+        load_mdp(tmp_path / "world.npz")

@@ -2,11 +2,12 @@
 
 ``python -m i2rl.analysis.benchmarks.sessions`` measures, on patrol instance 2 at 30 % observability:
 
-- IPOPT iterations of a session's programs, warm-started and from nothing;
+- IPOPT iterations of a session's programs (warm-started within the session and from the one before), and of
+  its last program from nothing;
 - the time of a session after 10 and after 1000 sessions, and the growth of memory in between;
 - the cumulative time of 239 online sessions against one batch run over all of them, and against batch
   re-run after every session;
-- the time of a session against trajectory length, trajectories a session, and states.
+- the time of one E- and M-step against trajectory length, trajectories a session, and states.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ from ...inference.lme import batch_lme, lme_i2rl
 from ...inference.maxent_constraints import FeatureTarget
 from ...inference.maxent_dual import CountProgram, DualProgram
 from ...inference.session import run_sessions
-from ...models.demonstration import Demonstration
+from ...models.demonstration import HIDDEN, UNKNOWN, Demonstration
 from ...models.evidence import Visibility
 from ...models.mdp import TabularMDP
 from ...models.planning import reward_of, simulate, soft_plan
@@ -38,7 +39,7 @@ def ipopt_iterations(sessions: int, seed: int = 0) -> dict[str, Any]:
     patrol = instance(2)
     demonstration = demonstrate(jax.random.key(seed), patrol, 30, sessions)[0]
     result = {}
-    for statistic in ("features", "seen"):
+    for statistic in ("features", "counts"):
         learner = lme_i2rl(patrol.mdp, patrol.visibility(30), statistic=statistic, solver="ipopt")
         slack = learner.configuration["slack"]
         features, counts = DualProgram(patrol.mdp), CountProgram(patrol.mdp)
@@ -47,17 +48,19 @@ def ipopt_iterations(sessions: int, seed: int = 0) -> dict[str, Any]:
         for one in demonstration.sessions():
             state, report = learner.update(state, one)
             kept = state.statistic
+            # With these two statistics what is kept is what the last program was about.
             if statistic == "features":
                 target = FeatureTarget(np.asarray(kept.features), np.asarray(kept.start))
-                cold.append(features.solve(target, slack / (1 - float(patrol.mdp.discount))).iterations)
-            elif float(kept.counts.sum()) > 0:
-                cold.append(counts.solve(np.asarray(kept.counts), slack).iterations)
+                solved = features.solve(target, slack / (1 - float(patrol.mdp.discount)))
+            else:
+                solved = counts.solve(np.asarray(kept.counts), slack)
+            cold.append(solved.iterations)
             warm.append(report.solver_iterations / report.iterations)
             per_session.append(report.solver_iterations)
         result[statistic] = {
-            "warm median per program": float(np.median(warm[1:])),
-            "warm median per session": float(np.median(per_session[1:])),
-            "cold median per program": float(np.median(cold)),
+            "warm, median per program": float(np.median(warm[1:])),
+            "warm, median per session": float(np.median(per_session[1:])),
+            "cold, median per program": float(np.median(cold)),
         }
     return result
 
@@ -134,7 +137,7 @@ def ring(n_states: int, n_actions: int = 4, n_features: int = 6, seed: int = 0) 
 
 
 def session_cost(mdp: TabularMDP, length: int, trajectories: int, sessions: int = 12) -> float:
-    """Median seconds of a session with a third of the states in view."""
+    """Median seconds of one E- and M-step of a session, with a third of the states in view."""
     view = Visibility(np.arange(mdp.n_states) < mdp.n_states // 3)
     weights = jnp.linspace(-1, 1, mdp.n_features)
     policy = soft_plan(mdp, reward_of(mdp, weights)).log_policy
@@ -143,11 +146,11 @@ def session_cost(mdp: TabularMDP, length: int, trajectories: int, sessions: int 
     full = Demonstration.from_pairs(np.asarray(states), np.asarray(actions))
     inside = np.asarray(view.in_view)[full.state] > 0
     hidden = Demonstration(
-        np.where(inside, full.kind, 2).astype(np.int8), np.where(inside, full.state, -1),
-        np.where(inside, full.action, -1), full.score,
+        np.where(inside, full.kind, HIDDEN).astype(np.int8), np.where(inside, full.state, UNKNOWN),
+        np.where(inside, full.action, UNKNOWN), full.score,
     )  # fmt: skip
     run = run_sessions(lme_i2rl(mdp, view), hidden.sessions(trajectories), key=jax.random.key(0))
-    return float(np.median([r.seconds for r in run.reports[2:]]))
+    return float(np.median([r.seconds / r.iterations for r in run.reports[2:]]))
 
 
 def main() -> None:
@@ -160,9 +163,13 @@ def main() -> None:
         "ipopt iterations": lambda: ipopt_iterations(60),
         "session time": steady_cost,
         "online against batch": lambda: online_against_batch(options.sessions, options.runs),
-        "seconds against states": lambda: {str(n): session_cost(ring(n), 5, 1) for n in (32, 124, 496, 1024)},
-        "seconds against length": lambda: {str(n): session_cost(ring(124), n, 1) for n in (5, 20, 80, 320)},
-        "seconds against trajectories": lambda: {
+        "seconds of a step against states": lambda: {
+            str(n): session_cost(ring(n), 5, 1) for n in (32, 124, 496, 1024)
+        },
+        "seconds of a step against length": lambda: {
+            str(n): session_cost(ring(124), n, 1) for n in (5, 20, 80, 320)
+        },
+        "seconds of a step against trajectories": lambda: {
             str(n): session_cost(ring(124), 5, n) for n in (1, 4, 16, 64)
         },
     }
