@@ -58,8 +58,8 @@ class GoAtBestTime(NamedTuple):
 class GoWhenBest(NamedTuple):
     """Watch on, plan afresh at every step, and go when no later departure is worth more (the default).
 
-    What is seen meanwhile corrects the forecast, meetings of the patrollers included: on instance 2 at 30 %
-    it reaches the goal in about nine runs of ten where :class:`GoAtBestTime` does in three of four.
+    What is seen meanwhile corrects the forecast. On instance 2 at 30 % it reaches the goal in about nine runs
+    of ten where :class:`GoAtBestTime` does in three of four.
     """
 
     def __call__(

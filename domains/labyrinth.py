@@ -13,7 +13,6 @@ pair, and deterministic moves named after where they lead: ``back`` to the paren
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache, partial
 from itertools import pairwise
@@ -24,7 +23,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ..models.demonstration import HIDDEN, SEEN, UNKNOWN, Demonstration, DemonstrationError, concatenate
+from ..models.demonstration import (
+    HIDDEN,
+    SEEN,
+    UNKNOWN,
+    Demonstration,
+    DemonstrationError,
+    concatenate,
+    parsed_lines,
+)
 from ..models.evidence import Visibility
 from ..models.mdp import TabularMDP
 from ..models.planning import reward_of, simulate, soft_plan
@@ -209,17 +216,7 @@ def read_bouts(lines: Iterable[str], source: str = "input") -> Iterator[Bout]:
     recording stopped while the animal was inside. Raises :class:`DemonstrationError` naming ``source``,
     line and position in ``nodes``.
     """
-    for number, line in enumerate(lines, start=1):
-        if not line.strip():
-            continue
-        where = f"{source}, line {number}"
-        try:
-            content = json.loads(line)
-        except json.JSONDecodeError as error:
-            ending = "" if line.endswith("\n") else " (the line has no end: the file may have been cut off)"
-            raise DemonstrationError(
-                f"{where}: not valid JSON at character {error.pos + 1}: {error.msg}{ending}"
-            ) from None
+    for _, where, content in parsed_lines(lines, source):
         if not isinstance(content, dict) or not isinstance(content.get("nodes"), list):
             raise DemonstrationError(f'{where}: a bout is an object with a list "nodes"')
         unknown = set(content) - {"id", "nodes", "frames"}

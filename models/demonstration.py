@@ -233,6 +233,24 @@ class Record(NamedTuple):
     demonstration: Demonstration
 
 
+def parsed_lines(lines: Iterable[str], source: str, first_line: int = 1) -> Iterator[tuple[int, str, Any]]:
+    """Number, place for messages, and content of each line of JSON Lines; blank lines are skipped.
+
+    Raises :class:`DemonstrationError` naming ``source`` and line.
+    """
+    for number, line in enumerate(lines, start=first_line):
+        if not line.strip():
+            continue
+        where = f"{source}, line {number}"
+        try:
+            yield number, where, json.loads(line)
+        except json.JSONDecodeError as error:
+            ending = "" if line.endswith("\n") else " (the line has no end: the file may have been cut off)"
+            raise DemonstrationError(
+                f"{where}: not valid JSON at character {error.pos + 1}: {error.msg}{ending}"
+            ) from None
+
+
 def read_trajectories(
     lines: Iterable[str], mdp: TabularMDP, source: str = "input", first_line: int = 1
 ) -> Iterator[Record]:
@@ -246,17 +264,7 @@ def read_trajectories(
     Raises :class:`DemonstrationError` naming ``source``, line and step.
     """
     names = _Names(mdp)
-    for number, line in enumerate(lines, start=first_line):
-        if not line.strip():
-            continue
-        where = f"{source}, line {number}"
-        try:
-            content = json.loads(line)
-        except json.JSONDecodeError as error:
-            ending = "" if line.endswith("\n") else " (the line has no end: the file may have been cut off)"
-            raise DemonstrationError(
-                f"{where}: not valid JSON at character {error.pos + 1}: {error.msg}{ending}"
-            ) from None
+    for number, where, content in parsed_lines(lines, source, first_line):
         identity = agent = None
         if isinstance(content, dict):
             unknown = set(content) - {"steps", "id", "agent"}
