@@ -1,0 +1,192 @@
+"""How far a mean of independent values in [0, 1] can be from its expectation.
+
+Hoeffding's inequality, which the dissertation's theorems use, knows only the range. Where values vary
+little, as discounted feature averages do, the observed variance gives much narrower intervals: Maurer and
+Pontil (2009), and the predictable plug-in intervals of Waudby-Smith and Ramdas (2023), whose confidence
+sequence holds at all sample sizes at once, so that an online learner may look at it after every session.
+
+Values are ``[..., n, K]``: ``n`` independent observations of ``K`` quantities. ``delta`` is the failure
+probability of *one* quantity's two-sided interval; for ``K`` at once give ``delta / K`` (union bound).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+# Largest bet of the predictable intervals; Waudby-Smith and Ramdas (2023) recommend 1/2 or 3/4.
+_LARGEST_BET = 0.75
+
+
+class Interval(NamedTuple):
+    """``center`` +- ``half_width``, each ``[..., K]``."""
+
+    center: Float[np.ndarray, "... K"]
+    half_width: Float[np.ndarray, "... K"]
+
+    def covers(self, expectation: Float[np.ndarray, "... K"]) -> np.ndarray:
+        """Whether each interval holds the expectation, boolean ``[..., K]``."""
+        return np.abs(self.center - expectation) <= self.half_width
+
+
+# -- intervals ----------------------------------------------------------------------------------------
+
+
+def hoeffding(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
+    """Hoeffding's interval ``mean +- sqrt(log(2 / delta) / (2 n))``."""
+    values = _in_unit_interval(values)
+    half = np.sqrt(_log(delta) / (2 * values.shape[-2]))
+    center = values.mean(axis=-2)
+    return Interval(center, np.full_like(center, half))
+
+
+def empirical_bernstein(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
+    """Interval from the observed variance (Maurer and Pontil 2009, Theorem 4).
+
+    ``mean +- sqrt(2 V log(4 / delta) / n) + 7 log(4 / delta) / (3 (n - 1))`` with the sample variance ``V``.
+    Raises ``ValueError`` for fewer than two values.
+    """
+    values = _in_unit_interval(values, least=2)
+    n = values.shape[-2]
+    return Interval(values.mean(axis=-2), _bernstein(values.var(axis=-2, ddof=1), n, delta))
+
+
+def predictable_bernstein(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
+    """Predictable plug-in interval (Waudby-Smith and Ramdas 2023, Theorem 2) for a fixed sample size.
+
+    Values are weighed by ``lambda_i``, chosen from the values before them to suit ``n``; the constant of
+    its lower-order term is half that of :func:`empirical_bernstein`. Depends on the order of the values.
+    """
+    values = _in_unit_interval(values)
+    n = values.shape[-2]
+    bets, squares = _bets(values, lambda t: np.full(len(t), n), delta)
+    return Interval(
+        (bets * values).sum(axis=-2) / bets.sum(axis=-2),
+        (_log(delta) + (_cost(bets) * squares).sum(axis=-2)) / bets.sum(axis=-2),
+    )
+
+
+def confidence_sequence(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
+    """Intervals after each value that hold at all times together (Waudby-Smith and Ramdas 2023, Theorem 2).
+
+    Arrays are ``[..., n, K]``: entry ``t`` uses the first ``t + 1`` values. With probability ``1 - delta``
+    none of them misses, however long the sequence and whatever stops it, so that later intervals may be
+    intersected with earlier ones.
+    """
+    values = _in_unit_interval(values)
+    bets, squares = _bets(values, lambda t: t * np.log(1 + t), delta)
+    total = bets.cumsum(axis=-2)
+    return Interval(
+        (bets * values).cumsum(axis=-2) / total,
+        (_log(delta) + (_cost(bets) * squares).cumsum(axis=-2)) / total,
+    )
+
+
+def _bernstein(variance: np.ndarray, n: int, delta: float) -> np.ndarray:
+    log = _log(delta / 2)
+    return np.sqrt(2 * variance * log / n) + 7 * log / (3 * (n - 1))
+
+
+def _bets(
+    values: np.ndarray, horizon: Callable[[np.ndarray], np.ndarray], delta: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Bets ``lambda_t`` and squared errors ``(X_t - mu_{t-1})^2`` of the predictions made before ``X_t``."""
+    t = np.arange(1, values.shape[-2] + 1)[:, None]
+    means = (0.5 + values.cumsum(axis=-2)) / (t + 1)
+    variances = (0.25 + ((values - means) ** 2).cumsum(axis=-2)) / (t + 1)
+    means, variances = _delayed(means, 0.5), _delayed(variances, 0.25)
+    bets = np.sqrt(2 * _log(delta) / (variances * horizon(t[:, 0])[:, None]))
+    return np.minimum(bets, _LARGEST_BET), (values - means) ** 2
+
+
+def _delayed(x: np.ndarray, first: float) -> np.ndarray:
+    return np.concatenate([np.full_like(x[..., :1, :], first), x[..., :-1, :]], axis=-2)
+
+
+def _cost(bets: np.ndarray) -> np.ndarray:
+    """``4 psi_E(lambda)``, to go with squared errors that are not multiplied by 4."""
+    return -np.log1p(-bets) - bets
+
+
+# -- sample sizes -------------------------------------------------------------------------------------
+
+
+def hoeffding_size(error: float, delta: float) -> float:
+    """Size at which Hoeffding's half-width is ``error``: ``log(2 / delta) / (2 error^2)``, unrounded."""
+    return _log(delta) / (2 * _positive("error", error) ** 2)
+
+
+def hoeffding_error(size: float, delta: float) -> float:
+    """Hoeffding's half-width after ``size`` values."""
+    return float(np.sqrt(_log(delta) / (2 * _positive("size", size))))
+
+
+def bernstein_size(deviation: float, error: float, delta: float) -> int:
+    """Smallest size at which :func:`empirical_bernstein` is as narrow as ``error``.
+
+    ``deviation`` is the values' standard deviation, taken to be what will be observed: a plan, while the
+    guarantee is the interval computed from the data themselves.
+    """
+    _positive("error", error)
+    return _smallest(lambda n: _bernstein(np.asarray(deviation**2), n, delta) <= error, least=2)
+
+
+def predictable_size(deviation: float, error: float, delta: float) -> int:
+    """Smallest size at which :func:`predictable_bernstein` is as narrow as ``error``; a plan likewise.
+
+    Includes the price of its first predictions for the least favourable expectation, 0 or 1.
+    """
+    _positive("error", error)
+    variance = deviation**2
+
+    def narrow(n: int) -> bool:
+        t = np.arange(1, n + 1)
+        # Expected squared error of the prediction before value t, which starts at 1/2 with a value's weight.
+        squares = variance + variance * (t - 1) / t**2 + 0.25 / t**2
+        known = np.concatenate([[0.25], (0.25 + squares.cumsum())[:-1] / t[1:]])
+        bets = np.minimum(np.sqrt(2 * _log(delta) / (known * n)), _LARGEST_BET)
+        return bool(_log(delta) + (_cost(bets) * squares).sum() <= error * bets.sum())
+
+    return _smallest(narrow, least=1)
+
+
+def _smallest(enough: Callable[[int], object], least: int) -> int:
+    low, high = least - 1, max(least, 1)
+    while not enough(high):
+        low, high = high, 2 * high
+    while high - low > 1:
+        middle = (low + high) // 2
+        low, high = (low, middle) if enough(middle) else (middle, high)
+    return high
+
+
+# -- border -------------------------------------------------------------------------------------------
+
+
+def _log(delta: float) -> float:
+    if not 0 < delta < 1:
+        raise ValueError(f"a failure probability lies strictly between 0 and 1, got {delta}")
+    return float(np.log(2 / delta))
+
+
+def _positive(name: str, x: float) -> float:
+    if not (np.isfinite(x) and x > 0):
+        raise ValueError(f"{name} must be positive, got {x}")
+    return x
+
+
+def _in_unit_interval(values: Float[np.ndarray, "... n K"], least: int = 1) -> np.ndarray:
+    values = np.asarray(values, float)
+    if values.ndim < 2:
+        raise ValueError(f"values must be [..., n, K], got shape {values.shape}")
+    if values.shape[-2] < least:
+        raise ValueError(f"an interval needs at least {least} values, got {values.shape[-2]}")
+    if not (values.min() >= -1e-9 and values.max() <= 1 + 1e-9):
+        raise ValueError(
+            f"values must lie in [0, 1], got {values.min():.4g} to {values.max():.4g}; "
+            "discounted features are to be multiplied by (1 - discount)"
+        )
+    return values
