@@ -31,6 +31,7 @@ _HOMES = {
         "fit_weights",
     ),
     "posterior": ("sample_posterior",),
+    "schedule": ("Harmonic",),
     "session": (
         "Fleet",
         "Learner",

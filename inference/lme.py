@@ -27,6 +27,7 @@ from ..models.mdp import TabularMDP
 from ..models.planning import SoftPlan, require_discounted, reward_of, soft_plan
 from .maxent import Solution, WarmStart, exponentiated_gradient, fit_counts, solve_dual
 from .maxent_constraints import FeatureTarget
+from .schedule import Schedule, described, program_slack, require_slack, require_slack_in
 from .session import Learner, Report
 from .smoothing import Evidence, blocked_posterior, evidence_of, gibbs_posterior, smooth_all
 from .statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
@@ -82,7 +83,7 @@ class _Method(NamedTuple):
     sensor: Imperfection
     statistic: Statistic
     completion: Callable[[Array, TabularMDP, Float[Array, "S A"], Evidence], Smoothed]
-    slack: float
+    slack: Schedule
     ridge: float
 
     def plan(self, weights: Float[Array, " K"], values: Float[Array, " S"]) -> SoftPlan:
@@ -109,9 +110,10 @@ class _Method(NamedTuple):
 
         return jnp.linalg.norm(jax.grad(likelihood)(weights))
 
-    def penalties(self, statistic: Any) -> tuple:
-        """Slack of the program, and the prior's precision per trajectory."""
-        return self.statistic.slack(self.mdp, self.slack), self.ridge / jnp.maximum(statistic.size, 1.0)
+    def penalties(self, statistic: Any, session: Int[Array, ""]) -> tuple:
+        """Slack of the program in a session, and the prior's precision per trajectory."""
+        slack = program_slack(self.slack, session, self.statistic.slack(self.mdp, 1.0))
+        return slack, self.ridge / jnp.maximum(statistic.size, 1.0)
 
 
 def lme_i2rl(
@@ -121,7 +123,7 @@ def lme_i2rl(
     statistic: str = "seen",
     completion: str = "exact",
     solver: str = "newton",
-    slack: float = DEFAULT_SLACK,
+    slack: Schedule = DEFAULT_SLACK,
     ridge: float = 0.0,
     draws: int = DEFAULT_DRAWS,
     iterations: int = 10,
@@ -144,9 +146,11 @@ def lme_i2rl(
         The M-step: proximal Newton in JAX; the CasADi program with IPOPT, warm-started from the last
         session; the CVXPY primal; the normalised exponentiated gradient as printed. The last two solve the
         program of the ``features`` statistic only.
-    slack : float
+    slack : float or function of the session's number
         Relaxation ``epsilon`` of the matching constraint: an L1 penalty of ``slack`` nats per trajectory
-        (``slack / (1 - gamma)`` with the ``features`` statistic, as in Theorem 1).
+        (``slack / (1 - gamma)`` with the ``features`` statistic, as in Theorem 1). Or a schedule, as in
+        Optax: a function that JAX can trace from the session's number, counted from 1, to it;
+        :class:`~.schedule.Harmonic` is that of the no-regret theorem (Eq. 4.3).
     ridge : float
         Precision of a Gaussian prior on the weights (nats in all, not per trajectory); for the newton and
         ipopt solvers.
@@ -158,17 +162,19 @@ def lme_i2rl(
     -------
     Learner
         Its ``update`` raises :class:`DemonstrationError` naming trajectory and step for an observation the
-        model rules out; the state it was given stays valid.
+        model rules out, and ``ValueError`` where a schedule turns negative; the state it was given stays
+        valid.
 
     Raises
     ------
     ValueError
-        For discount 1 or an unknown option.
+        For discount 1, an unknown option, or a slack that is negative or no number.
     """
     require_discounted(mdp)
     method = _method(mdp, sensor, statistic, completion, slack, ridge, draws)
     configuration = {
-        "statistic": statistic, "completion": completion, "solver": solver, "slack": slack, "ridge": ridge,
+        "statistic": statistic, "completion": completion, "solver": solver, "slack": described(slack),
+        "ridge": ridge,
         "draws": draws if completion != "exact" else 0, "iterations": iterations, "tolerance": tolerance,
         "sensor": _digest(sensor),
     }  # fmt: skip
@@ -184,8 +190,8 @@ def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: Imperfection, **option
     carried = lme_i2rl(mdp, sensor, name="LME-I2RL with random weights", **options)
     configuration = carried.configuration
     method = _method(
-        mdp, sensor, configuration["statistic"], configuration["completion"], configuration["slack"],
-        configuration["ridge"], configuration["draws"],
+        mdp, sensor, configuration["statistic"], configuration["completion"],
+        options.get("slack", DEFAULT_SLACK), configuration["ridge"], configuration["draws"],
     )  # fmt: skip
     start = partial(_started_afresh, method)
     return _learner(
@@ -210,7 +216,7 @@ def _method(
     sensor: Imperfection,
     statistic: str,
     completion: str,
-    slack: float,
+    slack: Schedule,
     ridge: float,
     draws: int,
 ) -> _Method:
@@ -221,8 +227,9 @@ def _method(
         raise ValueError(f"completion must be exact, blocked or gibbs, got {completion!r}")
     if completion != "exact" and draws < 1:
         raise ValueError(f"a sampled completion needs at least one draw, got {draws}")
-    if not slack >= 0 or not ridge >= 0:
-        raise ValueError(f"slack and ridge must not be negative, got {slack} and {ridge}")
+    require_slack(slack)
+    if not ridge >= 0:
+        raise ValueError(f"ridge must not be negative, got {ridge}")
 
     def exact(key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Smoothed:
         del key
@@ -271,6 +278,7 @@ def _em(
     m_step: Callable[..., Solution],
     iterations: int,
     tolerance: float,
+    session: Int[Array, ""],
     kept: Any,
     evidence: Evidence,
     seen: Bool[Array, "n L"],
@@ -278,14 +286,14 @@ def _em(
     weights: Float[Array, " K"],
     values: Float[Array, " S"],
 ) -> _Iterate:
-    """E- and M-steps in one compiled loop."""
+    """E- and M-steps of the session with this number in one compiled loop."""
 
     def step(point: _Iterate) -> _Iterate:
         key, sample = jax.random.split(point.key)
         plan = method.plan(point.weights, point.values)
         working, _ = method.working(kept, sample, plan, evidence, seen)
         solution = m_step(
-            method.mdp, working, *method.penalties(working), WarmStart(point.weights, plan.values)
+            method.mdp, working, *method.penalties(working, session), WarmStart(point.weights, plan.values)
         )
         gradient = lax.cond(
             point.iterations == 0,
@@ -379,6 +387,7 @@ def _learner(
                 in_jax[solver],
                 iterations,
                 tolerance,
+                state.session + 1,
                 state.statistic,
                 evidence,
                 seen,
@@ -399,13 +408,13 @@ def _learner(
 
         @jax.jit
         def expectation(
-            kept: Any, key: Array, weights: Array, values: Array, evidence: Evidence, seen: Array
+            state: LMEState, key: Array, weights: Array, values: Array, evidence: Evidence, seen: Array
         ) -> tuple:
             key, sample = jax.random.split(key)
             plan = method.plan(weights, values)
-            working, own = method.working(kept, sample, plan, evidence, seen)
+            working, own = method.working(state.statistic, sample, plan, evidence, seen)
             gradient = method.gradient(weights, plan.values, working)
-            return key, plan.values, own, gradient, working, *method.penalties(working)
+            return key, plan.values, own, gradient, working, *method.penalties(working, state.session + 1)
 
         def run(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
             evidence, seen, key, weights, values = opening(state, demonstration)
@@ -413,7 +422,7 @@ def _learner(
             first = jnp.array(jnp.nan)
             while steps < iterations and change > tolerance:
                 key, values, own, gradient, working, slack, ridge = expectation(
-                    state.statistic, key, weights, values, evidence, seen
+                    state._replace(program=()), key, weights, values, evidence, seen
                 )
                 if not np.isfinite(own):  # no program to solve: update says which step cannot be
                     break
@@ -442,6 +451,7 @@ def _learner(
         began = time.perf_counter()
         if not demonstration.lengths.any():
             raise DemonstrationError("a session needs at least one trajectory with a step")
+        require_slack_in(method.slack, int(state.session) + 1)
         new, report = run(state, demonstration.bucketed())
         if not np.isfinite(report.demonstration_log_likelihood):
             require_possible(method.sensor, mdp, demonstration)
@@ -506,12 +516,14 @@ def batch_lme(
 ) -> Batch:
     """Batch latent maximum-entropy IRL: EM over all trajectories from several random starts, best one kept.
 
-    Parameters as for :func:`lme_i2rl`. ``fit`` raises :class:`DemonstrationError` for an observation the
-    model rules out.
+    Parameters as for :func:`lme_i2rl`, but without sessions ``slack`` is a number. ``fit`` raises
+    :class:`DemonstrationError` for an observation the model rules out.
     """
     require_discounted(mdp)
     if restarts < 1 or iterations < 1:
         raise ValueError(f"restarts and iterations must be at least 1, got {restarts} and {iterations}")
+    if callable(slack):
+        raise ValueError("batch learning has no sessions, so its slack must be a number, not a schedule")
     method = _method(mdp, sensor, "counts", "exact", slack, ridge, 0)
 
     @jax.jit
@@ -527,6 +539,7 @@ def batch_lme(
                 _newton,
                 iterations,
                 tolerance,
+                jnp.ones((), int),
                 kept,
                 evidence,
                 seen,

@@ -4,7 +4,19 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from i2rl.inference import batch_lme, lme_i2rl, lme_i2rl_with_random_weights, me_i2rl, run_sessions
+from i2rl.inference import (
+    Harmonic,
+    batch_lme,
+    fit_counts,
+    fleet,
+    lme_i2rl,
+    lme_i2rl_with_random_weights,
+    me_i2rl,
+    run_sessions,
+    solve_dual,
+)
+from i2rl.inference.journal import Journal
+from i2rl.inference.maxent_constraints import FeatureTarget
 from i2rl.inference.smoothing import evidence_of, log_likelihoods
 from i2rl.models import (
     Demonstration,
@@ -209,6 +221,14 @@ def test_an_impossible_observation_names_its_place_and_costs_nothing_learned(mdp
         ({"solver": "adam"}, "solver must be"),
         ({"solver": "cvxpy"}, "needs the features statistic"),
         ({"slack": -1.0}, "must not be negative"),
+        ({"ridge": -1.0}, "ridge must not be negative"),
+        ({"slack": float("nan")}, "must not be negative, infinite or NaN"),
+        ({"slack": "small"}, "a number or a function of the session's number, got 'small'"),
+        ({"slack": lambda i: -1.0 / i}, "gives -1.0 in session 1"),
+        ({"slack": Harmonic(-1.0)}, r"Harmonic\(c=-1.0\) gives -1.0 in session 1"),
+        ({"slack": lambda i: 0.5 - 0.125 * i}, "gives -0.125 in session 5"),
+        ({"slack": lambda i: 0.1 if i < 3 else 0.0}, "that JAX can trace"),
+        ({"slack": lambda i: jnp.ones(2) / i}, r"one number a session.*shape \(2,\)"),
         ({"solver": "cvxpy", "statistic": "features", "ridge": 1.0}, "no ridge"),
         ({"completion": "gibbs", "draws": 0}, "at least one draw"),
         ({"iterations": 0}, "at least one iteration"),
@@ -228,3 +248,115 @@ def test_the_same_key_gives_the_same_bits(mdp, sensor, demonstration):
     learner = lme_i2rl(mdp, sensor, completion="blocked", draws=20)
     a, b = (run_sessions(learner, demonstration.sessions(16), key=jax.random.key(4)).state for _ in range(2))
     assert np.array_equal(a.weights, b.weights)
+
+
+# -- schedules ----------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("statistic", ["features", "counts"])
+def test_a_harmonic_slack_meets_equation_4_3_in_every_session(mdp, statistic):
+    full = sample_demonstration(jax.random.key(2), TrajectoryLaw(mdp, TRUE, Sensor(), 6), 4)
+    c = 0.05
+    # One E- and M-step: what is kept of whole trajectories is what was fitted, up to the filled-in tail.
+    learner = me_i2rl(mdp, statistic=statistic, slack=Harmonic(c), iterations=60, tolerance=1e-9)
+    state = learner.init(jax.random.key(0))
+    for i, demonstration in enumerate(full.sessions(1), start=1):
+        state, _ = learner.update(state, demonstration)
+        if statistic == "features":
+            target = FeatureTarget(state.statistic.features, state.statistic.start)
+            alone = solve_dual(mdp, target, c / i)
+        else:
+            alone = fit_counts(mdp, state.statistic.counts, c / i)
+        assert np.allclose(state.weights, alone.weights, atol=1e-4)
+
+
+def test_any_other_schedule_has_the_units_of_the_number(mdp, sensor, demonstration):
+    number, schedule = (
+        run_sessions(
+            lme_i2rl(mdp, sensor, statistic="features", slack=slack),
+            demonstration.select(slice(0, 16)).sessions(8), key=jax.random.key(0),
+        ).state.weights
+        for slack in (0.02, lambda i: 0.02)
+    )  # fmt: skip
+    assert np.allclose(number, schedule, atol=1e-12)
+
+
+def test_every_solver_follows_a_schedule(mdp, sensor, demonstration):
+    few = demonstration.select(slice(0, 24))
+    weights = [
+        run_sessions(
+            lme_i2rl(
+                mdp, sensor, solver=solver, statistic="features", slack=Harmonic(0.1), iterations=8,
+                tolerance=1e-6,
+            ),
+            few.sessions(8), key=jax.random.key(0),
+        ).state.weights
+        for solver in ("newton", "ipopt", "cvxpy")
+    ]  # fmt: skip
+    assert np.allclose(weights[0], weights[1], atol=2e-4)
+    assert np.allclose(weights[0], weights[2], atol=2e-4)
+    simplex = me_i2rl(mdp, solver="exponentiated gradient", statistic="features", slack=Harmonic(0.1))
+    state, _ = simplex.update(simplex.init(jax.random.key(0)), Demonstration.from_pairs([[0]], [[1]]))
+    assert float(jnp.sum(state.weights)) == pytest.approx(1)
+
+
+def test_a_schedule_counts_each_streams_sessions_in_a_fleet(mdp, sensor, demonstration):
+    learner = lme_i2rl(mdp, sensor, slack=Harmonic(0.2))
+    old = run_sessions(learner, demonstration.select(slice(0, 4)).sessions(2), key=jax.random.key(1)).state
+    states = [old, learner.init(jax.random.key(2))]
+    parts = [demonstration.select(slice(4, 6)), demonstration.select(slice(6, 8))]
+    alone = [learner.update(s, d)[0].weights for s, d in zip(states, parts, strict=True)]
+    stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
+    both = Demonstration(*(np.stack(leaves) for leaves in zip(*parts, strict=True)))
+    together, _ = fleet(learner).update(stacked, both)
+    assert together.session.tolist() == [3, 1]
+    assert np.allclose(together.weights, alone, atol=1e-6)
+
+
+def test_a_schedule_resumes_from_a_journal_and_another_one_is_refused(mdp, sensor, demonstration, tmp_path):
+    few = demonstration.select(slice(0, 6))
+    whole = run_sessions(
+        lme_i2rl(mdp, sensor, slack=Harmonic(0.2)), few.sessions(2), key=jax.random.key(0)
+    ).state
+    learner = lme_i2rl(mdp, sensor, slack=Harmonic(0.2))
+    with Journal.open(tmp_path / "a.db", learner) as journal:
+        run_sessions(learner, few.select(slice(0, 4)).sessions(2), key=jax.random.key(0), journal=journal)
+    again = lme_i2rl(mdp, sensor, slack=Harmonic(0.2))
+    with Journal.open(tmp_path / "a.db", again) as journal:
+        rest = run_sessions(again, few.select(slice(4, 6)).sessions(2), journal=journal).state
+        with pytest.raises(ValueError, match="another learner"):
+            run_sessions(
+                lme_i2rl(mdp, sensor, slack=Harmonic(0.1)), few.sessions(), key=jax.random.key(0),
+                journal=journal,
+            )  # fmt: skip
+    assert np.array_equal(whole.weights, rest.weights)
+
+
+def test_schedules_are_told_apart_by_their_values(mdp, sensor):
+    def signature(slack):
+        return lme_i2rl(mdp, sensor, slack=slack).signature
+
+    assert signature(lambda i: 0.3 / i) == signature(lambda session: 0.3 / session)
+    different = [0.3, Harmonic(0.3), Harmonic(0.4), lambda i: 0.3 / i, lambda i: 0.3 / (i + (i > 900))]
+    assert len({signature(slack) for slack in different}) == len(different)
+
+
+def test_a_schedule_that_turns_negative_late_is_refused_when_it_does(mdp, sensor):
+    demonstration = Demonstration.from_pairs([[0]], [[1]])
+    learner = lme_i2rl(mdp, sensor, slack=lambda i: 256 - i / 4)
+    state = learner.init(jax.random.key(0))._replace(session=jnp.array(1023))
+    state, _ = learner.update(state, demonstration)
+    with pytest.raises(ValueError, match=r"gives -0\.25 in session 1025"):
+        learner.update(state, demonstration)
+    # A fleet raises nothing, but its weights stay what they were.
+    one = jax.tree.map(lambda x: x[None], state)
+    after, _ = fleet(learner).update(one, Demonstration(*(x[None] for x in demonstration)))
+    assert np.array_equal(after.weights[0], state.weights)
+
+
+def test_random_weights_follow_the_schedule_and_batch_refuses_one(mdp, sensor, demonstration):
+    learner = lme_i2rl_with_random_weights(mdp, sensor, slack=Harmonic(1e6))
+    state, _ = learner.update(learner.init(jax.random.key(0)), demonstration)
+    assert np.all(np.asarray(state.weights) == 0)
+    with pytest.raises(ValueError, match="batch learning has no sessions"):
+        batch_lme(mdp, sensor, slack=Harmonic(0.1))
