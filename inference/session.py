@@ -11,11 +11,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Float
 
 from ..models.demonstration import Demonstration
@@ -109,6 +111,40 @@ def fleet(learner: Learner) -> Fleet:
     update = jax.jit(jax.vmap(learner.session))
     init = jax.vmap(learner.init)
     return Fleet(lambda key, streams: init(jax.random.split(key, streams)), update)
+
+
+def run_streams(
+    learner: Learner,
+    key: Array,
+    demonstrations: Demonstration,
+    keep: Callable[[Any, Report], Any] | None = None,
+) -> tuple[Any, Any]:
+    """Run a learner over whole streams in one compiled program, for studies of many repetitions.
+
+    ``demonstrations`` holds arrays ``[R, T, n, L]``: ``R`` streams of ``T`` sessions. Returns the final
+    states ``[R]`` and what ``keep(state, report)``, a pure function called after each session (the report
+    by default), gave: arrays ``[R, T]``. Streams run one after the other, so that none waits for the
+    slowest, as the mapped programs of :func:`fleet` do; on a CPU that is the faster way. Observations are
+    not checked, as in a fleet; of the keys, stream ``i`` gets that which stream ``i`` of a fleet gets.
+    Raises ``ValueError`` for a learner whose solver runs outside JAX, or arrays of another rank.
+    """
+    if learner.session is None:
+        raise ValueError(f"{learner.name} solves its programs outside JAX, so it cannot run compiled streams")
+    shape = np.shape(demonstrations.kind)
+    if len(shape) != 4:
+        raise ValueError(f"streams need arrays [streams, sessions, trajectories, steps], got {list(shape)}")
+    session, init = learner.session, learner.init
+
+    def one(inputs: tuple) -> Any:
+        def step(state: Any, demonstration: Demonstration) -> tuple:
+            state, report = session(state, demonstration)
+            return state, report if keep is None else keep(state, report)
+
+        start, stream = inputs
+        return lax.scan(step, init(start), stream)
+
+    inputs = (jax.random.split(key, shape[0]), jax.tree.map(jnp.asarray, demonstrations))
+    return jax.jit(partial(lax.map, one))(inputs)
 
 
 # -- stopping -----------------------------------------------------------------------------------------
@@ -234,19 +270,19 @@ def run_sessions(
 
 
 def average_regret(
-    expert: Float[np.ndarray, " T"], learned: Float[np.ndarray, " T"]
-) -> Float[np.ndarray, " T"]:
+    expert: Float[np.ndarray, "... T"], learned: Float[np.ndarray, "... T"]
+) -> Float[np.ndarray, "... T"]:
     """Average regret after each session: running mean of the log-likelihood given away.
 
     ``expert`` and ``learned`` are the sessions' log-likelihoods under the true weights and under the
-    learner's (``learner.log_likelihood(state, true_weights)`` and the reports' ``log_likelihood``). The form
-    of chapter 4, ``LL(theta_E | X_i, .) - LL(theta^i | X_i, .)``, whose two sides share their data;
-    Definition 8 prints the previous session's estimate on the previous session's data. Raises
-    ``ValueError`` if lengths differ.
+    learner's (``learner.log_likelihood(state, true_weights)`` and the reports' ``log_likelihood``); leading
+    axes are streams. The form of chapter 4, ``LL(theta_E | X_i, .) - LL(theta^i | X_i, .)``, whose two sides
+    share their data; Definition 8 prints the previous session's estimate on the previous session's data.
+    Raises ``ValueError`` if shapes differ.
     """
     expert, learned = np.asarray(expert, float), np.asarray(learned, float)
-    if expert.shape != learned.shape or expert.ndim != 1:
+    if expert.shape != learned.shape or expert.ndim < 1:
         raise ValueError(
             f"log-likelihoods must be two lists of one length, got {expert.shape} and {learned.shape}"
         )
-    return np.cumsum(expert - learned) / np.arange(1, len(expert) + 1)
+    return np.cumsum(expert - learned, axis=-1) / np.arange(1, expert.shape[-1] + 1)

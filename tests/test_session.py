@@ -13,6 +13,7 @@ from i2rl.inference import (
     lme_i2rl,
     me_i2rl,
     run_sessions,
+    run_streams,
 )
 from i2rl.inference.journal import Journal
 from i2rl.models import (
@@ -124,6 +125,8 @@ def test_average_regret_is_the_running_mean_of_the_likelihood_given_away():
     assert np.allclose(average_regret(np.array([0.0, 0.0, 0.0]), np.array([-3.0, -1.0, 1.0])), [3, 2, 1])
     with pytest.raises(ValueError, match="one length"):
         average_regret(np.zeros(2), np.zeros(3))
+    streams = np.array([[3.0, 1.0], [0.0, -4.0]])
+    assert np.allclose(average_regret(streams, np.zeros((2, 2))), [[3, 2], [0, -2]])
 
 
 def test_sessions_run_until_the_stream_ends_or_a_criterion_says_so(world, stream):
@@ -171,6 +174,27 @@ def test_a_fleet_learns_what_each_learner_alone_would(world, stream):
 def test_a_learner_whose_solver_is_outside_jax_makes_no_fleet(world):
     with pytest.raises(ValueError, match="outside JAX"):
         fleet(lme_i2rl(*world, solver="ipopt"))
+
+
+def test_whole_streams_in_one_program_learn_what_each_learner_alone_would(world, stream):
+    learner = lme_i2rl(*world)
+    parts = [stream.select([2 * i, 2 * i + 1]) for i in range(2)]
+    arrays = Demonstration(*(np.stack([x[:, None] for x in leaves]) for leaves in zip(*parts, strict=True)))
+    states, reports = run_streams(learner, jax.random.key(5), arrays)
+    _, sizes = run_streams(learner, jax.random.key(5), arrays, lambda state, report: state.statistic.size)
+    assert sizes.tolist() == [[1, 2], [1, 2]]
+    for i, key in enumerate(jax.random.split(jax.random.key(5), 2)):
+        alone = run_sessions(learner, parts[i].sessions(), state=learner.init(key))
+        assert np.allclose(states.weights[i], alone.state.weights, atol=1e-6)
+        expected = [r.log_likelihood for r in alone.reports]
+        assert np.allclose(reports.log_likelihood[i], expected, atol=1e-8)
+
+
+def test_streams_need_a_learner_in_jax_and_four_axes(world, stream):
+    with pytest.raises(ValueError, match="outside JAX"):
+        run_streams(lme_i2rl(*world, solver="ipopt"), jax.random.key(0), stream)
+    with pytest.raises(ValueError, match=r"\[streams, sessions, trajectories, steps\], got \[8, 4\]"):
+        run_streams(lme_i2rl(*world), jax.random.key(0), stream)
 
 
 def test_the_signature_tells_methods_and_worlds_apart(world, random_mdp):
