@@ -44,6 +44,7 @@ _HOMES = {
         "average_regret",
         "fleet",
         "run_sessions",
+        "run_streams",
     ),
     "smoothing": (
         "Evidence",
