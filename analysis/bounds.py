@@ -42,7 +42,13 @@ from .assumptions import (
     WHOLE,
     Bound,
 )
-from .concentration import Interval, empirical_bernstein, predictable_bernstein
+from .concentration import (
+    Interval,
+    empirical_bernstein,
+    predictable_bernstein,
+    predictable_half_width,
+    smallest,
+)
 
 # -- one side of the union ----------------------------------------------------------------------------
 
@@ -418,6 +424,68 @@ def observed_bound(
         (*(EXPERT if weights is None else tuple(a for a in EXPERT if a is not WEIGHTS)), SOLVED),
     )
     return ObservedBound(interval.center / (1 - discount), slack, bound)
+
+
+def observed_size(deviations: Float[np.ndarray, " K"], error: float, confidence: float) -> int:
+    """Trajectories with which :func:`observed_bound` is about ``2 K error / (1 - gamma)`` nats.
+
+    ``deviations [K]`` are the standard deviations of the features' discounted averages ``(1 - gamma) f_k``
+    (:func:`~i2rl.models.feature_deviations` times ``1 - gamma``, or a guess). A plan: what is guaranteed is
+    the bound computed once the trajectories are there. Raises ``ValueError`` for a confidence outside
+    (0, 1), an error that is not positive, or deviations outside [0, 1/2].
+    """
+    spread = np.atleast_1d(np.asarray(deviations, float))
+    if spread.ndim != 1 or not ((spread >= 0) & (spread <= 0.5)).all():
+        raise ValueError(f"deviations of averages in [0, 1] lie in [0, 0.5], got {spread}")
+    delta = (1 - _probability("confidence", confidence)) / len(spread)
+    _positive("error", error)
+    return smallest(lambda n: np.mean([predictable_half_width(x, n, delta) for x in spread]) <= error)
+
+
+def demonstrations_needed(
+    n_features: int,
+    epsilon: float,
+    confidence: float,
+    discount: float = 0.99,
+    *,
+    epsilon_s: float = 0.05,
+    deviations: Float[np.ndarray, " K"] | None = None,
+) -> pd.DataFrame:
+    """How many trajectories are enough, by the theorem and by the tighter bounds.
+
+    Every row is for the same log-likelihood error, Theorem 2's ``4 K epsilon_l / (1 - gamma)`` nats, with
+    the same confidence; ``delta`` and ``delta_s`` share what is left of it equally. Rows differ in what they
+    use: ``theorem`` samples hidden steps and knows the features' range; ``exact completion`` does not
+    sample, so that ``epsilon_s`` and ``delta_s`` are spent on the trajectories; ``observed spread`` (a row
+    for each of some standard deviations of the discounted averages ``(1 - gamma) f_k``, or one for the
+    ``deviations [K]`` given) knows how much the features vary.
+
+    Returns a table with columns ``trajectories``, ``draws`` (of the hidden steps, in all) and
+    ``error_nats``. Raises ``ValueError`` for a confidence outside (0, 1), errors that are not positive, or
+    deviations that are not ``[K]``.
+    """
+    _counted("n_features", n_features), _positive("epsilon_s", epsilon_s), _positive("epsilon", epsilon)
+    delta = (1 - _probability("confidence", confidence)) / 2
+    total = epsilon + epsilon_s
+    rows: list[tuple[str, int, int]] = [
+        (
+            "theorem",
+            math.ceil(size_for(epsilon, delta, n_features)),
+            math.ceil(size_for(epsilon_s, delta, n_features)),
+        ),
+        ("exact completion", math.ceil(size_for(total, 2 * delta, n_features)), 0),
+    ]
+    if deviations is None:
+        for spread in (0.05, 0.1, 0.2):
+            size = observed_size(np.full(n_features, spread), total, confidence)
+            rows.append((f"observed spread {spread}", size, 0))
+    else:
+        if np.shape(deviations) != (n_features,):
+            raise ValueError(f"{n_features} features, but deviations of shape {np.shape(deviations)}")
+        rows.append(("observed spread", observed_size(deviations, total, confidence), 0))
+    table = pd.DataFrame(rows, columns=["bound", "trajectories", "draws"]).set_index("bound")
+    table["error_nats"] = 2 * n_features * total / (1 - _discounted(discount))
+    return table
 
 
 # -- Table 7.1 ----------------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""The command line: ``i2rl run``, ``simulate``, ``learn`` and ``show``.
+"""The command line: ``i2rl run``, ``bounds``, ``simulate``, ``learn`` and ``show``.
 
 Heavy modules are imported inside the commands, so that ``--help`` answers at once.
 """
@@ -142,6 +142,35 @@ def run_labyrinth(
     for table in labyrinth.tables(study):
         _console().print(table)
     print(f"Report: {report}")
+
+
+# -- bounds -------------------------------------------------------------------------------------------
+
+
+@app.command()
+def bounds(
+    features: Annotated[int | None, typer.Option(help="Number of reward features, K.")] = None,
+    epsilon: Annotated[float, typer.Option(help="Error of a feature's discounted average, in (0, 1).")] = 0.1,
+    confidence: Annotated[float, typer.Option(help="Probability with which the bound is to hold.")] = 0.8,
+    epsilon_s: Annotated[float, typer.Option(help="Error of sampling the hidden steps.")] = 0.05,
+    discount: Annotated[float | None, typer.Option(help="Discount; 0.99 unless --mdp says.")] = None,
+    deviation: Annotated[
+        float | None, typer.Option(help="Standard deviation of the features' discounted averages.")
+    ] = None,
+    mdp: Annotated[
+        str | None, typer.Option(help="patrol1, patrol2 or patrol3: its features, discount and spread.")
+    ] = None,
+    as_json: Json = False,
+) -> None:
+    """Say how many demonstrations are enough: by the theorem, by tighter bounds, and what is assumed."""
+    from . import bounds_answer
+
+    with _reported_errors():
+        answer = bounds_answer.answer(features, epsilon, confidence, epsilon_s, discount, deviation, mdp)
+    if as_json:
+        print(json.dumps(_plain(bounds_answer.summary(answer))))
+    else:
+        bounds_answer.print_answer(answer, _console())
 
 
 # -- simulate -----------------------------------------------------------------------------------------

@@ -131,29 +131,30 @@ def bernstein_size(deviation: float, error: float, delta: float) -> int:
     guarantee is the interval computed from the data themselves.
     """
     _positive("error", error)
-    return _smallest(lambda n: _bernstein(np.asarray(deviation**2), n, delta) <= error, least=2)
+    return smallest(lambda n: _bernstein(np.asarray(deviation**2), n, delta) <= error, least=2)
 
 
-def predictable_size(deviation: float, error: float, delta: float) -> int:
-    """Smallest size at which :func:`predictable_bernstein` is as narrow as ``error``; a plan likewise.
+def predictable_half_width(deviation: float, size: int, delta: float) -> float:
+    """What :func:`predictable_bernstein`'s half-width will be about, for values of known deviation.
 
     Includes the price of its first predictions for the least favourable expectation, 0 or 1.
     """
+    variance, t = deviation**2, np.arange(1, size + 1)
+    # Expected squared error of the prediction before value t, which starts at 1/2 with a value's weight.
+    squares = variance + variance * (t - 1) / t**2 + 0.25 / t**2
+    known = np.concatenate([[0.25], (0.25 + squares.cumsum())[:-1] / t[1:]])
+    bets = np.minimum(np.sqrt(2 * _log(delta) / (known * size)), _LARGEST_BET)
+    return float((_log(delta) + (_cost(bets) * squares).sum()) / bets.sum())
+
+
+def predictable_size(deviation: float, error: float, delta: float) -> int:
+    """Smallest size at which :func:`predictable_bernstein` is as narrow as ``error``; a plan likewise."""
     _positive("error", error)
-    variance = deviation**2
-
-    def narrow(n: int) -> bool:
-        t = np.arange(1, n + 1)
-        # Expected squared error of the prediction before value t, which starts at 1/2 with a value's weight.
-        squares = variance + variance * (t - 1) / t**2 + 0.25 / t**2
-        known = np.concatenate([[0.25], (0.25 + squares.cumsum())[:-1] / t[1:]])
-        bets = np.minimum(np.sqrt(2 * _log(delta) / (known * n)), _LARGEST_BET)
-        return bool(_log(delta) + (_cost(bets) * squares).sum() <= error * bets.sum())
-
-    return _smallest(narrow, least=1)
+    return smallest(lambda n: predictable_half_width(deviation, n, delta) <= error)
 
 
-def _smallest(enough: Callable[[int], object], least: int) -> int:
+def smallest(enough: Callable[[int], object], least: int = 1) -> int:
+    """Smallest integer from ``least`` on that is enough, by doubling and bisection."""
     low, high = least - 1, max(least, 1)
     while not enough(high):
         low, high = high, 2 * high

@@ -9,6 +9,7 @@ horizon by the implicit function theorem: no unrolling.
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -327,6 +328,20 @@ def feature_expectations(
 ) -> Float[Array, " K"]:
     """Expected discounted features ``E_X[phi_k]`` of a policy."""
     return jnp.einsum("sa,sak->k", occupancy(mdp, policy, initial), mdp.features)
+
+
+def feature_deviations(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array, " K"]:
+    """Standard deviation over trajectories of their discounted features ``sum_t gamma^t phi_k(s_t, a_t)``.
+
+    Exact: the second moment of a discounted sum obeys a Bellman equation with discount ``gamma^2`` and rate
+    ``phi^2 + 2 gamma phi E[mu(s')]`` (Sobel 1982). Raises ``ValueError`` for discount 1.
+    """
+    to_go = features_to_go(mdp, policy)
+    onward = jax.vmap(mdp.expect_next, in_axes=1, out_axes=2)(to_go)
+    rate = jnp.einsum("sa,sak->sk", policy, mdp.features * (mdp.features + 2 * mdp.discount * onward))
+    squared = replace(mdp, discount=mdp.discount**2)
+    second = mdp.initial @ solve_values(squared, policy, rate)
+    return jnp.sqrt(jnp.maximum(second - (mdp.initial @ to_go) ** 2, 0.0))
 
 
 # -- finite horizon -----------------------------------------------------------------------------------

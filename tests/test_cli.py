@@ -374,6 +374,46 @@ def test_a_reader_that_leaves_is_no_error(house, flags):
 # -- the study --------------------------------------------------------------------------------------------
 
 
+def test_bounds_answers_with_the_theorem_the_tighter_ones_and_what_is_assumed():
+    asked = ["bounds", "--features", "6", "--epsilon", "0.1", "--confidence", "0.8"]
+    told = CliRunner().invoke(app, asked)
+    assert told.exit_code == 0
+    assert "What is assumed" in told.output
+    assert "trajectories are independent" in told.output
+    content = json.loads(CliRunner().invoke(app, [*asked, "--json"]).stdout)
+    sizes = {row["bound"]: row["trajectories"] for row in content["bounds"]}
+    # Table 7.1(a) rounds 239.4 down; the promise needs 240.
+    assert sizes["theorem"] == 240
+    assert sizes["observed spread 0.05"] < sizes["exact completion"] < sizes["theorem"]
+
+
+def test_bounds_of_a_domain_checks_what_it_can_and_says_what_is_worth_nothing():
+    content = json.loads(CliRunner().invoke(app, ["bounds", "--mdp", "patrol2", "--json"]).stdout)
+    holds = {a["name"]: a["holds"] for a in content["assumptions"]}
+    assert holds["features"] is holds["weights"] is holds["soft_expert"] is True
+    assert holds["independent"] is None
+    assert content["ignorance_nats"] < content["bounds"][0]["error_nats"]
+    assert content["informative"]["theorem"] > content["informative"]["observed spread"] > 240
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--features", "6", "--confidence", "1.2"], "confidence must lie strictly between 0 and 1, got 1.2"),
+        (["--features", "6", "--epsilon", "-0.1"], "epsilon must be positive, got -0.1"),
+        (["--features", "0"], "n_features must be at least 1, got 0"),
+        (["--features", "6", "--deviation", "0.7"], "deviations of averages in [0, 1] lie in [0, 0.5]"),
+        ([], "say how many features the reward has"),
+        (["--mdp", "patrol2", "--features", "6"], "leave those out"),
+        (["--mdp", "labyrinth"], "patrol1, patrol2 or patrol3"),
+    ],
+)
+def test_bounds_refuses_what_makes_no_sense(options, message):
+    told = CliRunner().invoke(app, ["bounds", *options])
+    assert told.exit_code == 1
+    assert message in told.stderr
+
+
 def test_the_patrol_study_writes_its_report(tmp_path):
     result = call(
         "run", "patrol", "--instance", 2, "--sessions", 3, "--trials", 4, "--runs", 1,

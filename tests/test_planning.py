@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from i2rl.models import (
     TabularMDP,
     deterministic_policy,
+    feature_deviations,
     feature_expectations,
     features_to_go,
     finite_hard_plan,
@@ -324,6 +325,8 @@ def test_simulation_collects_the_expected_features(random_mdp):
     collected = np.einsum("t,ntk->nk", 0.8 ** np.arange(length), np.asarray(mdp.features)[states, actions])
     error = np.abs(collected.mean(0) - feature_expectations(mdp, plan.policy))
     assert (error <= 4 * collected.std(0) / np.sqrt(n) + 0.8**length * 5).all()
+    # The standard error of a standard deviation of 20 000 values is half a percent.
+    np.testing.assert_allclose(feature_deviations(mdp, plan.policy), collected.std(0), rtol=0.03)
     fixed, _ = simulate(jax.random.key(1), mdp, plan.log_policy, 5, first=jnp.array(3))
     assert fixed[0] == 3
 
