@@ -26,7 +26,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from .assumptions import (
     COMPLETION,
@@ -174,7 +174,9 @@ class Regret(NamedTuple):
     bound: Bound
 
 
-def no_regret(c: float, session_sizes: Sequence[int], n_features: int, discount: float) -> Regret:
+def no_regret(
+    c: float, session_sizes: Int[np.ndarray, " T"] | Sequence[int], n_features: int, discount: float
+) -> Regret:
     """Theorem 3 (chapter 4), Theorem 5 (appendix B): average regret with ``epsilon_i / (1 - gamma) = c / i``.
 
     ``Regret_T <= 2 K c H_T / T`` with probability at least ``prod_i max(0, 1 - delta_i)``, ``delta_i = 2 K
@@ -230,7 +232,8 @@ class Monotonicity(NamedTuple):
 
 
 def monotonicity(
-    log_likelihoods: Float[np.ndarray, " T"], session_sizes: Sequence[int] | None = None
+    log_likelihoods: Float[np.ndarray, " T"],
+    session_sizes: Int[np.ndarray, " T"] | Sequence[int] | None = None,
 ) -> Monotonicity:
     """Lemmas 1 and 3 (Lemma 5 of appendix B, Lemma 7 of appendix E): likelihood rises with every session.
 
@@ -324,8 +327,8 @@ def rimeo_confidence(
 
 def rimeo_no_regret(
     c: float,
-    session_sizes: Sequence[int],
-    session_samples: Sequence[int],
+    session_sizes: Int[np.ndarray, " T"] | Sequence[int],
+    session_samples: Int[np.ndarray, " T"] | Sequence[int],
     perception: Perception,
     n_features: int,
     discount: float,
@@ -563,7 +566,7 @@ def _discounted(discount: float) -> float:
     return discount
 
 
-def _session_sizes(sizes: Sequence[int]) -> np.ndarray:
+def _session_sizes(sizes: Int[np.ndarray, " T"] | Sequence[int]) -> np.ndarray:
     counts = np.asarray(sizes)
     if counts.ndim != 1 or len(counts) == 0 or not (counts >= 1).all():
         raise ValueError(f"session sizes must be a list of positive numbers, got {sizes!r}")

@@ -152,8 +152,10 @@ def complete_features(
     def one(inputs: tuple) -> tuple:
         key, codes = inputs
         evidence = jax.vmap(
-            lambda c: step_log_evidence(sensor, mdp.n_states, mdp.n_actions, *c, jnp.array(jnp.nan))
-        )(codes)
+            lambda k, s, a: step_log_evidence(
+                sensor, mdp.n_states, mdp.n_actions, k, s, a, jnp.array(jnp.nan)
+            )
+        )(*codes.T)
         factors, live = evidence + expert.log_policy, jnp.ones(length, bool)
         pairs = smooth(mdp, factors, live).pairs
         exact = jnp.einsum("l,lsa,sak->k", powers[:-1], pairs, mdp.features)
@@ -304,7 +306,8 @@ def learned_coverage(
     gaps = []
     for i in range(0, runs, batch):
         part = codes[i : i + batch]
-        demonstrations = Demonstration(*jnp.moveaxis(part, -1, 0), jnp.full(part.shape[:-1], jnp.nan))
+        kind, state, action = jnp.moveaxis(part, -1, 0)
+        demonstrations = Demonstration(kind, state, action, jnp.full(kind.shape, jnp.nan))  # type: ignore[arg-type]
         states = learners.init(jax.random.fold_in(begin, i), len(part))
         gaps.append(gap(learners.update(states, demonstrations)[0].weights))
     name = f"{theorem.source}, LME-I2RL"

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -110,7 +111,7 @@ def main() -> None:
     options = parser.parse_args()
     key, runs = jax.random.key(options.seed), options.runs
     small, patrol, short = random_setting(), patrol_setting(500), patrol_setting(150)
-    studies = (
+    studies: tuple[tuple[Callable[..., list[Coverage]], Setting, tuple], ...] = (
         (full_view_coverage, small, (240, 0.9)),
         (occluded_coverage, small, (60, 16, 0.1)),
         (learned_coverage, small, (60, 16, 0.1)),
