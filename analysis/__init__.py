@@ -58,6 +58,7 @@ _HOMES = {
         "policy_error",
         "quantile_band",
     ),
+    "online_methods": ("methods_table", "turning_places"),
     "report": ("Picture", "Section", "Table", "write_report"),
     "stream": ("learn_stream",),
     "style": ("DARK", "LIGHT", "Theme", "save", "save_themes"),

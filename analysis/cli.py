@@ -173,6 +173,28 @@ def bounds(
         bounds_answer.print_answer(answer, _console())
 
 
+@run.command("methods")
+def run_methods(
+    instance: Instance = 2,
+    sessions: Annotated[int, typer.Option(min=1, help="Sessions of five steps a patroller.")] = 120,
+    runs: Annotated[int, typer.Option(min=1, help="Independent repetitions.")] = 3,
+    seed: Seed = 0,
+    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-methods"),
+    as_json: Json = False,
+) -> None:
+    """Compare online methods on a patrol in full view: how many pairs does each need, what does it keep?"""
+    from . import online_methods
+
+    with _reported_errors(), _progress(as_json) as advance:
+        study = online_methods.study(instance, sessions=sessions, runs=runs, seed=seed, advance=advance)
+        online_methods.write(study, report)
+    if as_json:
+        print(json.dumps(online_methods.summary(study)))
+    else:
+        online_methods.print_tables(study, _console())
+        print(f"Report: {report / 'index.html'}")
+
+
 # -- simulate -----------------------------------------------------------------------------------------
 
 

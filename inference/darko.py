@@ -108,10 +108,10 @@ def _margin(
     return Margin(expected - statistic.features, statistic, plan.values, own)
 
 
-def darko(
+def darko_i2rl(
     mdp: TabularMDP,
     *,
-    learning_rate: float | None = None,
+    learning_rate: float = 1.0,
     decay: float = 0.5,
     radius: float = math.inf,
     steps: int = 1,
@@ -129,9 +129,9 @@ def darko(
     mdp : TabularMDP
         The expert's process, discount below 1; goals that end the task as :func:`ending_at` makes them.
         Its initial distribution must allow the goals, where sessions start.
-    learning_rate : float or None
-        ``lambda``, per unit of discounted features; ``1 - gamma`` by default, so that a margin of one
-        feature in every step moves its weight by one.
+    learning_rate : float
+        ``lambda``, per unit of discounted features. The default is what ``i2rl run methods`` finds good on
+        the second patrol, from sessions of five steps.
     decay : float
         ``lambda_i = lambda / i^decay``. One half is what keeps the regret of online gradient descent
         without a horizon sublinear (Zinkevich 2003); 0 keeps the rate constant.
@@ -154,15 +154,17 @@ def darko(
         For discount 1 or an option that is out of range.
     """
     require_discounted(mdp)
-    rate = 1 - float(mdp.discount) if learning_rate is None else learning_rate
-    if not 0 < rate < math.inf or not radius > 0:
-        raise ValueError(f"learning rate and radius must be positive, got {rate} and {radius}")
+    if not 0 < learning_rate < math.inf or not radius > 0:
+        raise ValueError(f"learning rate and radius must be positive, got {learning_rate} and {radius}")
     if not decay >= 0:
         raise ValueError(f"the decay must not be negative, got {decay}")
     if steps < 1:
         raise ValueError(f"a session needs at least one step, got {steps}")
     settings = _Settings(
-        jnp.asarray(rate, float), jnp.asarray(decay, float), jnp.asarray(radius, float), jnp.asarray(steps)
+        jnp.asarray(learning_rate, float),
+        jnp.asarray(decay, float),
+        jnp.asarray(radius, float),
+        jnp.asarray(steps),
     )
 
     def init(key: Array) -> DarkoState:
@@ -184,7 +186,7 @@ def darko(
         values: dict[str, Any] = {field: x if x.ndim else x.item() for field, x in arrays.items()}
         return new, Report(**values)._replace(seconds=time.perf_counter() - began)
 
-    configuration = {"learning_rate": rate, "decay": decay, "radius": radius, "steps": steps}
+    configuration = {"learning_rate": learning_rate, "decay": decay, "radius": radius, "steps": steps}
     return Learner("DARKO", mdp, configuration, init, update, session)
 
 

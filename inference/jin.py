@@ -58,7 +58,7 @@ def with_state_features(mdp: TabularMDP) -> TabularMDP:
     return replace(mdp, features=indicators, labels=labels)
 
 
-def correction(
+def reward_correction(
     mdp: TabularMDP, weights: Float[Array, " K"], state: Int[Array, ""], action: Int[Array, ""]
 ) -> Correction:
     """``v_i`` of one observed pair: how the value of its action, less that of the predicted one, grows.
@@ -80,7 +80,7 @@ def correction(
     return Correction(now + mdp.discount * later, predicted != action)
 
 
-def jin(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner:
+def jin_i2rl(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner:
     """Jin et al.'s online IRL: a reward table over states, corrected by each pair that was predicted wrongly.
 
     A session of one pair is the method's own (section 3.2); a demonstration of several steps is gone
@@ -118,11 +118,12 @@ def jin(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner:
     return _learner("Jin et al.", with_state_features(mdp), learning_rate)
 
 
-def jin_with_features(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner:
-    """The same corrections to the weights of ``mdp``'s own features; parameters as for :func:`jin`.
+def jin_i2rl_with_features(mdp: TabularMDP, *, learning_rate: float = 0.3) -> Learner:
+    """The same corrections to the weights of ``mdp``'s own features; parameters as for :func:`jin_i2rl`.
 
     A control: what the method reaches where the features of the domain are given to it as to the others.
-    Weights start at ``1 / sqrt(K)``, so here the learning rate matters.
+    Weights start at ``1 / sqrt(K)``, so here the learning rate matters; the default is what
+    ``i2rl run methods`` finds good on the second patrol.
     """
     return _learner("Jin et al. with features", mdp, learning_rate)
 
@@ -164,7 +165,7 @@ def _session(
 
         def learn() -> tuple:
             weights, mistakes = carry
-            found = correction(mdp, weights, s, a)
+            found = reward_correction(mdp, weights, s, a)
             step = jnp.where(found.mistaken, rate, 0.0) * found.direction
             return weights + step, mistakes + found.mistaken
 

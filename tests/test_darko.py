@@ -7,7 +7,7 @@ import pytest
 
 from i2rl.inference import FeatureTarget, fleet, me_i2rl, run_sessions, solve_dual
 from i2rl.inference.darko import (
-    darko,
+    darko_i2rl,
     ending_at,
     feature_margin,
     goal_sessions,
@@ -17,11 +17,8 @@ from i2rl.inference.darko import (
 from i2rl.models import (
     Demonstration,
     DemonstrationError,
-    Sensor,
-    TrajectoryLaw,
     concatenate,
     reward_of,
-    sample_demonstration,
     soft_plan,
 )
 from i2rl.models.demonstration import UNKNOWN
@@ -34,13 +31,26 @@ def plan_of(mdp, weights):
 
 @pytest.fixture(scope="module")
 def world(random_mdp):
-    return random_mdp(5, n_states=6, n_actions=3, n_successors=2, n_features=3)
+    return random_mdp(5, n_states=6, n_actions=3, n_successors=2, n_features=3, masked=True)
 
 
 def sampled(mdp, weights, n, length, seed=0):
-    return sample_demonstration(
-        jax.random.key(seed), TrajectoryLaw(mdp, jnp.asarray(weights), Sensor(), length), n
-    )
+    """Trajectories of the soft policy of some weights."""
+    rng = np.random.default_rng(seed)
+    policy = np.asarray(plan_of(mdp, jnp.asarray(weights)).policy)
+    successors, chances = np.asarray(mdp.successors), np.asarray(mdp.probabilities)
+
+    def draw(probabilities):
+        below = np.cumsum(probabilities, axis=-1) < rng.random((n, 1))
+        return np.minimum(below.sum(-1), probabilities.shape[-1] - 1)
+
+    here = draw(np.broadcast_to(mdp.initial, (n, mdp.n_states)))
+    states, actions = [], []
+    for _ in range(length):
+        states.append(here)
+        actions.append(draw(policy[here]))
+        here = successors[here, actions[-1], draw(chances[here, actions[-1]])]
+    return Demonstration.from_pairs(np.stack(states, 1), np.stack(actions, 1))
 
 
 def test_the_margin_is_the_gradient_of_me_i2rls_program_for_the_session_alone(world):
@@ -64,20 +74,19 @@ def test_the_margin_is_the_gradient_of_me_i2rls_program_for_the_session_alone(wo
     _, report = forgetful.update(state, session)
     assert report.gradient == pytest.approx(float(jnp.linalg.norm(found.margin)))
     rate = 0.01
-    learner = darko(world, learning_rate=rate)
+    learner = darko_i2rl(world, learning_rate=rate)
     moved, _ = learner.update(learner.init(jax.random.key(0))._replace(weights=weights), session)
     assert np.allclose((weights - moved.weights) / rate, found.margin, atol=1e-9)
 
 
 def test_one_session_learned_to_the_end_solves_me_i2rls_program(random_mdp):
     mdp = ending_at(random_mdp(2, n_states=5, n_actions=3, n_features=2), np.arange(5) == 4)
-    law = TrajectoryLaw(mdp, jnp.array([-0.5, 0.4]), Sensor(), 64)
-    session = sample_demonstration(jax.random.key(1), law, 32)
+    session = sampled(mdp, [-0.5, 0.4], 32, 64)
     session = session.select(np.flatnonzero(session.state[:, -1] == 5)[:16])
     assert session.n_trajectories == 16  # these have ended: nothing is left to fill in
     target = feature_margin(mdp, jnp.zeros(2), session).statistic
     solution = solve_dual(mdp, FeatureTarget(target.features, target.start))
-    learner = darko(mdp, learning_rate=0.5, decay=0.0, steps=3000)
+    learner = darko_i2rl(mdp, learning_rate=0.5, decay=0.0, steps=800)
     state, report = learner.update(learner.init(jax.random.key(0)), session)
     assert np.allclose(state.weights, solution.weights, atol=1e-6)
     assert float(jnp.linalg.norm(feature_margin(mdp, state.weights, session).margin)) < 1e-6
@@ -86,7 +95,7 @@ def test_one_session_learned_to_the_end_solves_me_i2rls_program(random_mdp):
 
 def test_nothing_of_earlier_sessions_is_kept_but_the_weights(world):
     first, second = (sampled(world, [1.0, -1.0, 0.0], 2, 4, seed) for seed in (0, 1))
-    learner = darko(world, learning_rate=0.1, decay=0.0)
+    learner = darko_i2rl(world, learning_rate=0.1, decay=0.0)
     state, _ = learner.update(learner.init(jax.random.key(0)), first)
     after, _ = learner.update(state, second)
     afresh = learner.init(jax.random.key(9))._replace(weights=state.weights)
@@ -97,7 +106,7 @@ def test_nothing_of_earlier_sessions_is_kept_but_the_weights(world):
 def test_many_sessions_find_the_weights(world):
     true = np.array([1.0, -1.0, 0.5])
     sessions = sampled(world, true, 4000, 4)
-    learner = darko(world, learning_rate=1.0)
+    learner = darko_i2rl(world, learning_rate=1.0)
     state = run_sessions(learner, sessions.sessions(2), key=jax.random.key(0)).state
     policy, expert = (np.asarray(plan_of(world, jnp.asarray(w)).policy) for w in (state.weights, true))
     start = learner.init(jax.random.key(0)).weights
@@ -107,44 +116,50 @@ def test_many_sessions_find_the_weights(world):
 
 def test_rate_and_radius_act_as_named(world):
     session = sampled(world, [1.0, -1.0, 0.0], 2, 4)
-    learner = darko(world, learning_rate=0.2)
+    learner = darko_i2rl(world, learning_rate=0.2)
     start = learner.init(jax.random.key(0))
     later = start._replace(session=jnp.asarray(3))
     early, late = (learner.update(s, session)[0].weights - start.weights for s in (start, later))
     assert np.allclose(early, 2 * late, atol=1e-9)  # the fourth session's rate is half the first's
-    bounded, _ = darko(world, learning_rate=50.0, radius=0.7).update(start, session)
-    free, _ = darko(world, learning_rate=50.0).update(start, session)
+    bounded, _ = darko_i2rl(world, learning_rate=50.0, radius=0.7).update(start, session)
+    free, _ = darko_i2rl(world, learning_rate=50.0).update(start, session)
     assert float(jnp.linalg.norm(free.weights)) > 0.7
     assert np.allclose(bounded.weights, 0.7 * free.weights / jnp.linalg.norm(free.weights))
 
 
-def test_a_fleet_learns_what_its_members_would(world):
-    sessions = [sampled(world, [1.0, -1.0, 0.0], 2, 4, seed) for seed in range(3)]
-    learner = darko(world, learning_rate=0.2)
+def impossible_pair(mdp):
+    """An action its state does not have, in arrays as large as the other sessions'."""
+    s, a = np.argwhere(~np.asarray(mdp.available))[0]
+    return Demonstration.from_pairs([[s]], [[a]]).padded(2, 4)
+
+
+def test_a_fleet_learns_what_its_members_would_and_nothing_from_the_impossible(world):
+    sessions = [sampled(world, [1.0, -1.0, 0.0], 2, 4, seed) for seed in range(2)]
+    learner = darko_i2rl(world, learning_rate=0.2)
     many = fleet(learner)
     states = many.init(jax.random.key(4), 3)
-    stacked = Demonstration(*(np.stack(parts) for parts in zip(*sessions, strict=True)))
+    stacked = Demonstration(
+        *(np.stack(parts) for parts in zip(*sessions, impossible_pair(world), strict=True))
+    )
     after, reports = many.update(states, stacked)
-    for i, session in enumerate(sessions[:2]):
+    for i, session in enumerate(sessions):
         state, report = learner.update(jax.tree.map(operator.itemgetter(i), states), session)
         assert np.allclose(after.weights[i], state.weights, atol=1e-9)
         assert reports.log_likelihood[i] == pytest.approx(report.log_likelihood)
+    assert after.session.tolist() == [1, 1, 0]
+    assert np.array_equal(after.weights[2], states.weights[2])
+    assert np.isneginf(reports.demonstration_log_likelihood[2])
 
 
-def test_an_impossible_observation_is_refused_and_leaves_a_fleet_as_it_was(random_mdp):
-    mdp = random_mdp(0, masked=True)
-    s, a = np.argwhere(~np.asarray(mdp.available))[0]
-    impossible = Demonstration.from_pairs([[s]], [[a]])
-    learner = darko(mdp)
+def test_an_impossible_observation_is_refused(world):
+    learner = darko_i2rl(world)
+    state = learner.init(jax.random.key(0))
     with pytest.raises(DemonstrationError, match="trajectory 0, step 0"):
-        learner.update(learner.init(jax.random.key(0)), impossible)
+        learner.update(state, impossible_pair(world))
     with pytest.raises(DemonstrationError, match="step 0"):
-        learner.update(learner.init(jax.random.key(0)), Demonstration.from_steps([["hidden"]], mdp))
-    many = fleet(learner)
-    states = many.init(jax.random.key(0), 1)
-    after, report = many.update(states, Demonstration(*(np.asarray(x)[None] for x in impossible)))
-    assert np.array_equal(after.weights, states.weights)
-    assert np.isneginf(report.demonstration_log_likelihood[0])
+        learner.update(state, Demonstration.from_steps([["hidden"]], world).padded(2, 4))
+    with pytest.raises(DemonstrationError, match="at least one trajectory"):
+        learner.update(state, Demonstration.from_steps([[]], world))
 
 
 # -- goals --------------------------------------------------------------------------------------------
@@ -192,7 +207,7 @@ def test_at_an_ending_goal_nothing_follows(world, dense_transitions):
     staying[np.arange(6), :, np.arange(6)] = 1
     kept = before * (~goals | (staying > 0))
     assert np.allclose(after[:6, :, :6], kept)
-    assert np.allclose(after[:6, :, 6], 1 - kept.sum(-1))
+    assert np.allclose(after[:6, :, 6], (before - kept).sum(-1))
     weights = jnp.array([1.0, 2.0, -0.5])
     plan = plan_of(ended, weights)
     assert plan.values[6] == pytest.approx(0)
@@ -200,7 +215,7 @@ def test_at_an_ending_goal_nothing_follows(world, dense_transitions):
     values = np.zeros(6)
     for _ in range(500):
         q = np.asarray(reward_of(world, weights)) + 0.9 * kept @ values
-        values = np.log(np.exp(q).sum(1))
+        values = np.log((np.exp(q) * np.asarray(world.available)).sum(1))
     assert np.allclose(plan.values[:6], values)
 
 
@@ -223,9 +238,9 @@ def test_an_episodes_end_is_its_last_step(world):
 def test_what_makes_no_sense_is_refused(world, random_mdp):
     for options in ({"learning_rate": 0.0}, {"radius": 0.0}, {"decay": -1.0}, {"steps": 0}):
         with pytest.raises(ValueError, match=r"must|at least"):
-            darko(world, **options)
+            darko_i2rl(world, **options)
     with pytest.raises(ValueError, match="discount 1"):
-        darko(random_mdp(0, discount=1.0))
+        darko_i2rl(random_mdp(0, discount=1.0))
     with pytest.raises(ValueError, match=r"boolean array \[6\]"):
         ending_at(world, np.zeros(6, bool))
     with pytest.raises(ValueError, match="boolean array"):

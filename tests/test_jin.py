@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from i2rl.inference.jin import correction, jin, jin_with_features, with_state_features
+from i2rl.inference.jin import jin_i2rl, jin_i2rl_with_features, reward_correction, with_state_features
 from i2rl.inference.journal import Journal
 from i2rl.inference.session import fleet, run_sessions
 from i2rl.models import (
@@ -72,7 +72,7 @@ def test_the_correction_is_the_gradient_of_the_difference_of_values(world, on_st
         q = values_of(mdp, policy, jnp.asarray(w))
         return float(q[state, action] - q[state, predicted])
 
-    found = jax.jit(correction)(mdp, jnp.asarray(weights), jnp.asarray(state), jnp.asarray(action))
+    found = jax.jit(reward_correction)(mdp, jnp.asarray(weights), jnp.asarray(state), jnp.asarray(action))
     steps = 1e-4 * np.eye(mdp.n_features)
     slope = [(advantage(weights + d) - advantage(weights - d)) / 2e-4 for d in steps]
     assert np.allclose(found.direction, slope, atol=1e-7)
@@ -86,7 +86,7 @@ def test_the_correction_is_the_gradient_of_the_difference_of_values(world, on_st
 
 def test_a_demonstration_is_learned_pair_by_pair(world):
     demonstration = walk(world, np.array([2, 1, 0, 2, 1, 1]), 0, 7)
-    learner = jin(world, learning_rate=0.3)
+    learner = jin_i2rl(world, learning_rate=0.3)
     at_once = run_sessions(learner, [demonstration], key=jax.random.key(0))
     one_by_one = run_sessions(learner, demonstration.fragments(1).sessions(), key=jax.random.key(0))
     assert int(one_by_one.state.session) == 7
@@ -106,7 +106,7 @@ def test_the_learning_rate_only_scales_a_reward_table(world):
     demonstration = walk(world, np.array([2, 1, 0, 2, 1, 1]), 1, 30)
     runs = [
         run_sessions(
-            jin(world, learning_rate=rate), demonstration.fragments(5).sessions(), key=jax.random.key(0)
+            jin_i2rl(world, learning_rate=rate), demonstration.fragments(5).sessions(), key=jax.random.key(0)
         )
         for rate in (0.25, 4.0)
     ]
@@ -121,7 +121,7 @@ def test_mistakes_are_bounded_where_the_expert_makes_every_correction_better(ran
     mdp = with_state_features(random_mdp(7, n_states=8, n_actions=2, n_successors=2, discount=0.05))
     true = np.random.default_rng(0).normal(size=8)
     expert = greedy(mdp, true)
-    learner = jin(mdp)
+    learner = jin_i2rl(mdp)
     state, steps = learner.init(jax.random.key(0)), []
     for pair in walk(mdp, expert, 0, 400).fragments(1).sessions():
         before = state.weights
@@ -138,7 +138,7 @@ def test_mistakes_are_bounded_where_the_expert_makes_every_correction_better(ran
 def test_what_is_not_seen_in_full_is_passed_over(world):
     seen = [(0, 1), (2, 2), (3, 0)]
     gaps = [seen[0], None, seen[1], {"s": 1}, "hidden", seen[2]]
-    learner = jin(world)
+    learner = jin_i2rl(world)
     with_gaps, without = (
         learner.update(learner.init(jax.random.key(0)), Demonstration.from_steps([steps], world))
         for steps in (gaps, seen)
@@ -154,7 +154,7 @@ def test_an_action_that_does_not_exist_is_refused(random_mdp):
     s, a = np.argwhere(~np.asarray(mdp.available))[0]
     t = int(np.flatnonzero(mdp.available[0])[0])
     impossible = Demonstration.from_pairs([[0, s]], [[t, a]])
-    learner = jin(mdp)
+    learner = jin_i2rl(mdp)
     with pytest.raises(DemonstrationError, match=f"trajectory 0, step 1: state s{s} has no action a{a}"):
         learner.update(learner.init(jax.random.key(0)), impossible)
     with pytest.raises(DemonstrationError, match="step 0: state 9 is out of range"):
@@ -169,7 +169,7 @@ def test_an_action_that_does_not_exist_is_refused(random_mdp):
 
 def test_a_fleet_learns_what_its_members_would(world):
     demonstrations = [walk(world, np.array([2, 1, 0, 2, 1, 1]), seed, 4) for seed in range(3)]
-    learner = jin_with_features(world, learning_rate=0.1)
+    learner = jin_i2rl_with_features(world, learning_rate=0.1)
     many = fleet(learner)
     stacked = Demonstration(*(np.stack(parts) for parts in zip(*demonstrations, strict=True)))
     states, reports = many.update(many.init(jax.random.key(0), 3), stacked)
@@ -181,7 +181,7 @@ def test_a_fleet_learns_what_its_members_would(world):
 
 def test_a_journal_resumes_it_to_the_bit(world, tmp_path):
     sessions = list(concatenate([walk(world, np.array([2, 1, 0, 2, 1, 1]), 3, 12)]).fragments(3).sessions())
-    learner = jin(world)
+    learner = jin_i2rl(world)
     whole = run_sessions(learner, sessions, key=jax.random.key(0))
     for part in (sessions[:2], sessions[2:]):
         with Journal.open(tmp_path / "journal.db", learner) as journal:
@@ -192,6 +192,6 @@ def test_a_journal_resumes_it_to_the_bit(world, tmp_path):
 
 def test_what_makes_no_sense_is_refused(world, random_mdp):
     with pytest.raises(ValueError, match="learning rate must be a positive number, got 0"):
-        jin(world, learning_rate=0)
+        jin_i2rl(world, learning_rate=0)
     with pytest.raises(ValueError, match="discount 1"):
-        jin(random_mdp(0, discount=1.0))
+        jin_i2rl(random_mdp(0, discount=1.0))

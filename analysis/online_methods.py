@@ -1,0 +1,389 @@
+"""The online methods of others beside this library's: Table 8.1 counted from the learners, and a study.
+
+The study gives every method the same fully observed patrol and asks how many state-action pairs it needs.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from matplotlib.figure import Figure
+from matplotlib.ticker import PercentFormatter
+
+from ..domains.patrol import LEFT, RIGHT, Patrol, demonstrate, instance
+from ..inference.darko import darko_i2rl, goal_sessions
+from ..inference.jin import jin_i2rl, jin_i2rl_with_features
+from ..inference.lme import lme_i2rl, lme_i2rl_with_random_weights, me_i2rl
+from ..inference.session import Learner, run_sessions
+from ..models.demonstration import Demonstration
+from ..models.evidence import Sensor
+from ..models.mdp import TabularMDP
+from ..models.planning import deterministic_policy, hard_plan, reward_of
+from .figures import _draw_band, _scale
+from .metrics import optimal_actions, policy_accuracy, quantile_band
+from .report import Picture, Section, Table, write_report
+from .style import Theme, dress, foot, head, new_figure, save_themes
+
+if TYPE_CHECKING:
+    import pandas
+    from rich.console import Console
+
+Advance = Callable[[str, float | None], None]
+PAIRS_PER_SESSION = 5
+# Learning rates tried, for each method that has one.
+RATES = (0.01, 0.03, 0.1, 0.3, 1.0, 3.0, 10.0)
+# Demonstrations that rates are chosen on come from keys no evaluation uses.
+_TUNING = 7919
+
+
+# -- Table 8.1 ----------------------------------------------------------------------------------------
+
+
+def methods_table(mdp: TabularMDP, demonstration: Demonstration | None = None) -> pandas.DataFrame:
+    """Table 8.1 as it stands in this library: what each method's reward is and what it carries on.
+
+    One row per method, ``reward`` and ``statistic`` being what they are made of and ``reward numbers`` and
+    ``statistic numbers`` how many floats that is, counted in the learner's own state on ``mdp``. Random keys,
+    session counters and warm starts, which follow from the rest, are neither. With a ``demonstration``
+    batch LME is added as a contrast: it keeps every pair (two numbers) of what was seen so far.
+    """
+    import pandas
+
+    sensor = Sensor()
+    learners = [
+        jin_i2rl(mdp),
+        jin_i2rl_with_features(mdp),
+        darko_i2rl(mdp),
+        me_i2rl(mdp, statistic="features"),
+        *(lme_i2rl(mdp, sensor, statistic=name) for name in ("seen", "counts", "features")),
+        lme_i2rl_with_random_weights(mdp, sensor),
+    ]
+    rows = [_described(learner) for learner in learners]
+    if demonstration is not None:
+        reward = ("theta [K]", mdp.n_features)
+        rows.append(("batch LME", *reward, "all trajectories", 2 * int(demonstration.lengths.sum())))
+    columns = ["method", "reward", "reward numbers", "statistic", "statistic numbers"]
+    return pandas.DataFrame(rows, columns=columns)
+
+
+def _described(learner: Learner) -> tuple[str, str, int, str, int]:
+    state = learner.init(jax.random.key(0))
+    chosen = learner.configuration.get("statistic")
+    parts = getattr(type(state.statistic), "_fields", ())
+    table = learner.mdp.feature_names == learner.mdp.state_names
+    return (
+        learner.name if chosen is None else f"{learner.name}, {chosen}",
+        "R [S]" if table else "theta [K]",
+        int(state.weights.size),
+        ", ".join(parts) or "none",
+        sum(int(np.size(leaf)) for leaf in jax.tree.leaves(state.statistic)),
+    )
+
+
+# -- the study ----------------------------------------------------------------------------------------
+
+
+class MethodCurve(NamedTuple):
+    """One method: ``accuracy [streams, points]``, LBA in [0, 1], and its learning rate (None: has none)."""
+
+    name: str
+    accuracy: Float[np.ndarray, "streams points"]
+    learning_rate: float | None
+
+
+class MethodsStudy(NamedTuple):
+    """Settings, the pairs seen at which accuracy was measured, the methods' curves, and the sweeps.
+
+    ``sweeps`` holds for each method with a learning rate its score at each of ``rates`` on the tuning
+    demonstrations: the median over streams of the mean accuracy over ``points``.
+    """
+
+    patrol: Patrol
+    sessions: int
+    runs: int
+    seed: int
+    points: Int[np.ndarray, " points"]
+    curves: tuple[MethodCurve, ...]
+    rates: tuple[float, ...]
+    sweeps: Mapping[str, Float[np.ndarray, " rates"]]
+    table: pandas.DataFrame
+
+
+class _Entry(NamedTuple):
+    """A method: how to make its learner at a rate, and how it cuts a stream of windows into sessions."""
+
+    learner: Callable[[float], Learner]
+    cut: Callable[[Iterable[Demonstration]], Iterable[Demonstration]] = lambda windows: windows
+    tuned: bool = True
+
+
+def turning_places(patrol: Patrol) -> Bool[np.ndarray, " S"]:
+    """Where a patroller turns round: it turns, and turns again in the same cell.
+
+    The goals DARKO is told of, from the true policy: in its favour, for nobody else is told anything.
+    """
+    policy = patrol.expert_policy().argmax(1)
+    turns = np.isin(policy, (LEFT, RIGHT))
+    following = np.asarray(patrol.mdp.successors)[np.arange(len(policy)), policy, 0]
+    return turns & turns[following]
+
+
+def study(
+    number: int = 2,
+    *,
+    sessions: int = 120,
+    runs: int = 3,
+    seed: int = 0,
+    rates: Sequence[float] = RATES,
+    methods: Sequence[str] | None = None,
+    advance: Advance = lambda description, fraction: None,
+) -> MethodsStudy:
+    """Run every method on the same fully observed patrols, ``runs`` times with each patroller a stream.
+
+    A stream is ``sessions`` windows of five pairs. Windows are the sessions of all methods but DARKO, whose
+    sessions end at the goals (:func:`turning_places`); what it learned at the last goal counts until the
+    next. Each learning rate is the :func:`chosen_rate` of ``rates`` by their score (see
+    :class:`MethodsStudy`) on one further run, drawn for this and used for nothing else.
+    ``methods`` names some of the methods, all by default. Raises ``ValueError`` for an instance or a method
+    that does not exist.
+    """
+    patrol = instance(number)
+    entries = _entries(patrol)
+    unknown = [name for name in methods or () if name not in entries]
+    if unknown:
+        raise ValueError(f"methods are {'; '.join(entries)}; got {unknown[0]!r}")
+    entries = {name: entry for name, entry in entries.items() if methods is None or name in methods}
+    points = np.unique(np.geomspace(1, sessions, 24).round().astype(int)) * PAIRS_PER_SESSION
+    streams = _streams(jax.random.key(seed), patrol, sessions, runs)
+    tuning = _streams(jax.random.key(seed + _TUNING), patrol, sessions, 1)
+    curves, sweeps = [], {}
+    for i, (name, entry) in enumerate(entries.items()):
+        advance(name, i / len(entries))
+        rate = None
+        if entry.tuned:
+            tried = [_accuracies(patrol, entry, float(r), tuning, points).mean(1) for r in rates]
+            sweeps[name] = np.median(tried, axis=1)
+            rate = chosen_rate(rates, sweeps[name])
+        measured = _accuracies(patrol, entry, 1.0 if rate is None else rate, streams, points)
+        curves.append(MethodCurve(name, measured, rate))
+    advance("done", 1.0)
+    table = methods_table(patrol.mdp, streams[0][1])
+    return MethodsStudy(patrol, sessions, runs, seed, points, tuple(curves), tuple(rates), sweeps, table)
+
+
+def _entries(patrol: Patrol) -> dict[str, _Entry]:
+    mdp, goals = patrol.mdp, turning_places(patrol)
+    return {
+        "Jin et al., table over states": _Entry(lambda rate: jin_i2rl(mdp, learning_rate=rate)),
+        "Jin et al., features": _Entry(lambda rate: jin_i2rl_with_features(mdp, learning_rate=rate)),
+        "DARKO, goals": _Entry(
+            lambda rate: darko_i2rl(mdp, learning_rate=rate), partial(goal_sessions, goals=goals)
+        ),
+        "DARKO, windows of 5": _Entry(lambda rate: darko_i2rl(mdp, learning_rate=rate)),
+        "ME-I2RL, features": _Entry(lambda _: me_i2rl(mdp, statistic="features"), tuned=False),
+        "LME-I2RL, seen": _Entry(lambda _: lme_i2rl(mdp, Sensor()), tuned=False),
+    }
+
+
+def chosen_rate(rates: Sequence[float], scores: Float[np.ndarray, " rates"]) -> float:
+    """The smallest rate whose score is within 0.01 of the best: larger ones gain too little to tell."""
+    good = np.asarray(scores) >= np.max(scores) - 0.01
+    return min(float(rate) for rate, kept in zip(rates, good, strict=True) if kept)
+
+
+def _streams(key: Array, patrol: Patrol, sessions: int, runs: int) -> list[tuple[Array, Demonstration]]:
+    """A key for the first weights, and the windows, of every patroller of every run."""
+    return [
+        (jax.random.fold_in(one, p), windows)
+        for one in jax.random.split(key, runs)
+        for p, windows in enumerate(demonstrate(one, patrol, 100, sessions, PAIRS_PER_SESSION))
+    ]
+
+
+def _accuracies(
+    patrol: Patrol,
+    entry: _Entry,
+    rate: float,
+    streams: Sequence[tuple[Array, Demonstration]],
+    points: Int[np.ndarray, " points"],
+) -> Float[np.ndarray, "streams points"]:
+    learner = entry.learner(rate)
+    optimal = optimal_actions(patrol.mdp, jnp.asarray(patrol.weights))
+    rows = []
+    for key, windows in streams:
+        sessions = list(entry.cut(windows.sessions()))
+        reports = run_sessions(learner, sessions, key=key).reports
+        weights = np.array([learner.init(key).weights, *(report.weights for report in reports)])
+        seen = np.cumsum([0, *(int(session.lengths.sum()) for session in sessions)])
+        # What was learned at the last session that had ended by then.
+        learned = weights[np.searchsorted(seen, points, side="right") - 1]
+        rows.append(np.asarray(_behaviour_accuracy(learner.mdp, optimal, jnp.asarray(learned))))
+    return np.array(rows)
+
+
+@jax.jit
+def _behaviour_accuracy(
+    mdp: TabularMDP, optimal: Bool[Array, "S A"], weights: Float[Array, "N K"]
+) -> Float[Array, " N"]:
+    """LBA of a reward that need not be of the features the true one is of."""
+
+    def accuracy(weights: Float[Array, " K"]) -> Float[Array, ""]:
+        policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, weights)).optimal)
+        return policy_accuracy(mdp, optimal, policy).overall
+
+    return jax.vmap(accuracy)(weights)
+
+
+# -- telling ------------------------------------------------------------------------------------------
+
+
+def draw(study: MethodsStudy, theme: Theme) -> Figure:
+    """Accuracy against state-action pairs seen (logarithmic): medians, and bands of the middle half.
+
+    One panel a family of methods, since six bands cannot be told apart; the last method, this library's
+    default, is repeated in all of them as a thin line to compare with.
+    """
+    figure = new_figure(theme, 9.6, 4.4)
+    reference = study.curves[-1]
+    families: dict[str, list[int]] = {}
+    for i, curve in enumerate(study.curves):
+        families.setdefault(_family(curve.name), []).append(i)
+    panels = np.atleast_1d(figure.subplots(1, len(families), sharey=True))
+    handles = []
+    for panel, (family, members) in zip(panels, families.items(), strict=True):
+        for i in members:
+            curve = study.curves[i]
+            _draw_band(panel, theme, i, curve.name, study.points, curve.accuracy, 0.5)
+        handles += panel.get_legend_handles_labels()[0]
+        if len(study.curves) - 1 not in members:
+            level = np.median(reference.accuracy, axis=0)
+            panel.plot(
+                study.points, level, color=theme.muted, linewidth=1.0, label=f"{reference.name}, median"
+            )
+        dress(panel, theme, title=family, x="state-action pairs seen")
+        _scale(panel, "x", "log")
+        panel.tick_params(axis="y", left=panel is panels[0])
+    compared = [line for line in panels[0].get_lines() if line.get_label() == f"{reference.name}, median"]
+    panels[0].set_ylabel("learned behaviour accuracy\n(share of states)", color=theme.ink)
+    panels[0].set_ylim(0, 1.02)
+    panels[0].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    head(figure, theme, handles + compared, title=_title(study))
+    streams = len(reference.accuracy)
+    foot(figure, theme, f"line: median; band: middle 50% of {streams} patrollers watched")
+    return figure
+
+
+def _family(name: str) -> str:
+    return "Jin et al." if name.startswith("Jin") else "DARKO" if name.startswith("DARKO") else "I2RL"
+
+
+def summary(study: MethodsStudy) -> dict[str, Any]:
+    """Settings, curves, sweeps and the live Table 8.1 as plain data."""
+    return {
+        "patrol": study.patrol.name,
+        "sessions": study.sessions,
+        "runs": study.runs,
+        "seed": study.seed,
+        "pairs": study.points.tolist(),
+        "methods": [
+            {
+                "method": curve.name,
+                "learning rate": curve.learning_rate,
+                "median accuracy": np.median(curve.accuracy, axis=0).tolist(),
+                "pairs to 90 %": _pairs_to(study, curve, 0.9),
+            }
+            for curve in study.curves
+        ],
+        "sweeps": {name: scores.tolist() for name, scores in study.sweeps.items()},
+        "table 8.1": study.table.to_dict("records"),
+    }
+
+
+def _pairs_to(study: MethodsStudy, curve: MethodCurve, level: float) -> int | None:
+    """Pairs from which on the median accuracy stays at ``level``; None if it does not."""
+    enough = np.median(curve.accuracy, axis=0) >= level
+    stays = np.logical_and.accumulate(enough[::-1])[::-1]
+    return int(study.points[np.argmax(stays)]) if stays.any() else None
+
+
+def _title(study: MethodsStudy) -> str:
+    return f"Online methods, {study.patrol.name}, everything in view"
+
+
+def _tables(study: MethodsStudy) -> tuple[Table, ...]:
+    results = []
+    for curve in study.curves:
+        band = quantile_band(curve.accuracy[:, -1])
+        reached = _pairs_to(study, curve, 0.9)
+        results.append((
+            curve.name, "-" if curve.learning_rate is None else f"{curve.learning_rate:g}",
+            "never" if reached is None else f"{reached}",
+            f"{100 * band.median:.1f} % ({100 * band.low:.0f}-{100 * band.high:.0f})",
+        ))  # fmt: skip
+    sweep = [(name, *(f"{score:.3f}" for score in scores)) for name, scores in study.sweeps.items()]
+    live = [tuple(row) for row in study.table.itertuples(index=False)]
+    return (
+        Table(
+            ("method", "learning rate", "pairs to stay at 90 %", f"LBA after {study.points[-1]} pairs"),
+            results,
+            "LBA: learned behaviour accuracy, median over streams (middle half).",
+        ),
+        Table(
+            ("mean LBA while learning", *(f"rate {rate:g}" for rate in study.rates)),
+            sweep,
+            "On a run used for nothing else. Above, each method has the smallest rate within 0.01 of its "
+            "best. A reward table over states learns the same policy at every rate.",
+        ),
+        Table(
+            tuple(study.table.columns),
+            live,
+            "Table 8.1, counted from the learners' states. R is a table over states, theta a weight a "
+            "feature. The dissertation lists LME-I2RL's statistic as the number of trajectories and their "
+            "features; the features statistic also keeps where they start, which its program needs. Batch "
+            "keeps everything it is given.",
+        ),
+    )
+
+
+_TEXT = """Every method is given the same pairs, all of them in view. Windows of five pairs are a session, \
+which for the method of Jin et al. is five sessions of one pair; DARKO's sessions also come as it has them, \
+from goal to goal, the goals (where a patroller turns round) being told to it alone. Jin's reward is a table \
+over states and cannot say what an action costs; its second form has the features that the others have.
+
+The patrollers pass one another by stopping, which no reward explains, and they are deterministic, which a \
+soft policy only approaches. With everything in view LME-I2RL and ME-I2RL are one learner: the two lines \
+differ in the statistic."""
+
+
+def print_tables(study: MethodsStudy, console: Console) -> None:
+    """Print the results, the sweeps and the live Table 8.1."""
+    from rich.table import Table as RichTable
+
+    for part in _tables(study):
+        table = RichTable(caption=part.caption, caption_justify="left")
+        for i, heading in enumerate(part.headings):
+            table.add_column(heading, justify="left" if i == 0 else "right")
+        for row in part.rows:
+            table.add_row(*map(str, row))
+        console.print(table)
+
+
+def write(study: MethodsStudy, folder: Path | str) -> Path:
+    """Write the report: ``index.html``, the picture in both themes, and ``results.json``."""
+    folder = Path(folder)
+    light, dark = save_themes(partial(draw, study), folder, "methods")
+    picture = Picture(
+        light, dark, "Accuracy of the learned behaviour against the number of state-action pairs seen.",
+        "Learned behaviour accuracy of each online method against pairs seen, on a logarithmic axis",
+    )  # fmt: skip
+    (folder / "results.json").write_text(json.dumps(summary(study), indent=2) + "\n")
+    section = Section(_title(study), _TEXT, _tables(study), [picture])
+    return write_report(folder, [section], title="Online methods")
