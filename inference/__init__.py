@@ -7,6 +7,8 @@ import importlib
 from typing import Any
 
 _HOMES = {
+    "darko": ("darko_i2rl", "ending_at", "feature_margin", "goal_sessions", "stopping_places", "with_end"),
+    "jin": ("jin_i2rl", "jin_i2rl_with_features", "reward_correction", "with_state_features"),
     "journal": ("Journal", "JournalBusy", "JournalError", "JournalView", "Position", "SessionRecord"),
     "lme": (
         "Batch",
