@@ -252,7 +252,7 @@ def regret_plot(
         label = f"{curve.name}, slope {slope.slope:.2f}"
         handles.append(Line2D([], [], color=color, linestyle=dashes, linewidth=1.9, label=label))
     if theorem is not None:
-        style = {"color": theme.muted, "linewidth": 1.4, "linestyle": (0, (1, 1.6))}
+        style: dict[str, Any] = {"color": theme.muted, "linewidth": 1.4, "linestyle": (0, (1, 1.6))}
         left.plot(sessions, theorem.average, **style)
         handles.append(Line2D([], [], label=theorem.name, **style))
     for i, bound in enumerate(sure):

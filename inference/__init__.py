@@ -40,6 +40,7 @@ _HOMES = {
         "LearningErrorChange",
         "LikelihoodChange",
         "MovingWindow",
+        "PolicyWindow",
         "Report",
         "Run",
         "StoppingCriterion",

@@ -19,7 +19,8 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
-Schedule: TypeAlias = "float | Callable[[Int[Array, '']], ArrayLike]"
+# Harmonic by name: type checkers do not see that a named tuple can be called.
+Schedule: TypeAlias = "float | Harmonic | Callable[[Int[Array, '']], ArrayLike]"
 
 # So many sessions of a schedule are looked at when a learner is made, and identify it.
 EXAMINED = 1000

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
@@ -213,6 +213,37 @@ class MovingWindow:
         if len(reports) < self.width:
             return False
         return float(np.std([getattr(r, self.of) for r in reports[-self.width :]])) <= self.tolerance
+
+
+class PolicyWindow:
+    """The learned behaviour has settled: the greedy policies of the last ``width`` sessions agree.
+
+    Each may differ from the current one in at most the share ``tolerance`` of all states. Needs no expert,
+    has no unit that depends on the data, and looks at what the learner is for: rewards may go on moving
+    where no decision depends on them. Raises ``ValueError`` for a width below 2 or a share outside [0, 1].
+    """
+
+    def __init__(self, width: int, tolerance: float, mdp: TabularMDP) -> None:
+        if width < 2:
+            raise ValueError(f"a window of policies needs at least 2 sessions, got {width}")
+        if not 0 <= tolerance <= 1:
+            raise ValueError(f"the tolerance is a share of the states in [0, 1], got {tolerance}")
+        self.width, self.tolerance = width, tolerance
+
+        def actions(weights: Float[Array, "w K"]) -> Int[Array, "w S"]:
+            def one(w: Float[Array, " K"]) -> Int[Array, " S"]:
+                return jnp.argmax(deterministic_policy(hard_plan(mdp, reward_of(mdp, w)).optimal), axis=1)
+
+            return lax.map(one, weights)
+
+        self._actions = jax.jit(actions)
+
+    def __call__(self, reports: Sequence[Report]) -> bool:
+        """Whether to stop after the last report."""
+        if len(reports) < self.width:
+            return False
+        actions = np.asarray(self._actions(np.stack([r.weights for r in reports[-self.width :]])))
+        return float((actions != actions[-1]).mean(axis=1).max()) <= self.tolerance
 
 
 # -- running ------------------------------------------------------------------------------------------
