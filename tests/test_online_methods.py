@@ -63,13 +63,13 @@ METHODS = ("Jin et al., features", "DARKO, goals", "LME-I2RL, seen")
 
 @cache
 def small_study():
-    return online_methods.study(2, sessions=12, runs=1, seed=1, rates=(0.3,), methods=METHODS)
+    return online_methods.study(2, sessions=8, runs=1, seed=1, rates=(0.3,), methods=METHODS)
 
 
 def test_every_method_is_measured_at_the_same_pairs():
     study = small_study()
     assert study.points[0] == 5
-    assert study.points[-1] == 60
+    assert study.points[-1] == 40
     assert tuple(curve.name for curve in study.curves) == METHODS
     for curve in study.curves:
         assert curve.accuracy.shape == (2, len(study.points))
@@ -103,7 +103,7 @@ def test_run_methods_writes_a_report(tmp_path, monkeypatch):
     result = CliRunner().invoke(app, ["run", "methods", "--report", str(folder), "--json"])
     content = json.loads(result.output)
     assert content == json.loads((folder / "results.json").read_text())
-    assert content["pairs"][-1] == 60
+    assert content["pairs"][-1] == 40
     assert [row["method"] for row in content["table 8.1"]][-1] == "batch LME"
 
 
