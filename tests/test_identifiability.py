@@ -236,41 +236,35 @@ def test_directions_form_a_basis(random_mdp):
 
 def two_rooms():
     """Left room {0, 1}, right room {2, 3}, a door from left to right only; both may be started in."""
-    successors = np.array([[[1], [2]], [[0], [3]], [[3], [2]], [[2], [3]]])
-    features = np.zeros((4, 2, 3))
+    successors = np.array([[1, 2, 0], [0, 3, 1], [3, 2, 2], [2, 3, 3]])[..., None].repeat(2, axis=2)
+    features = np.zeros((4, 3, 2))
     features[0, 0, 0] = 1  # left only
     features[2, 1, 1] = 1  # right only
-    return TabularMDP.from_successors(
-        successors, np.ones(successors.shape), features, discount=0.9,
-        states=("left a", "left b", "right a", "right b"), feature_names=("in left", "in right", "nowhere"),
-    )  # fmt: skip
+    return small(TabularMDP.from_successors(successors, np.full((4, 3, 2), 0.5), features, discount=0.9))
 
 
 def test_what_demonstrations_never_show_is_not_visited():
     mdp = two_rooms()
-    assert [d.kind for d in unidentified_directions(mdp)] == ["never active"]
-    weights = np.ones(3)
+    assert unidentified_directions(mdp) == ()
     right = Demonstration.from_pairs(np.array([[2, 3, 2], [3, 2, 2]]), np.array([[0, 0, 1], [0, 1, 1]]))
-    result = identifiability(mdp, Sensor(), right, weights)
-    assert [d.kind for d in result.exact] == ["never active", "not visited"]
-    np.testing.assert_allclose(np.abs(result.exact[1].vector), [1, 0, 0], atol=1e-12)
-    assert "`in left`" in result.exact[1].description
-    assert "left a" in result.exact[1].description
-    assert np.isinf(result.standard_errors[[0, 2]]).all()
+    result = identifiability(mdp, CLEAR, right.padded(ROWS, LENGTH), THETA)
+    assert [d.kind for d in result.exact] == ["not visited"]
+    np.testing.assert_allclose(np.abs(result.exact[0].vector), [1, 0], atol=1e-12)
+    assert "`f0`" in result.exact[0].description
+    assert "2 states that the demonstrations never show, such as s0" in result.exact[0].description
+    assert np.isinf(result.standard_errors[0])
     assert np.isfinite(result.standard_errors[1])
+    assert "1 of 2 directions" in describe(result)
     section = identifiability_section({"agent": result})
     assert any("not determined" in row for table in section.tables for row in table.rows)
-    assert "2 of 3 directions" in describe(result)
     left = Demonstration.from_pairs(np.array([[0, 1, 0], [1, 3, 2]]), np.array([[0, 0, 1], [1, 0, 1]]))
-    assert [d.kind for d in identifiability(mdp, Sensor(), left, weights).exact] == ["never active"]
+    assert identifiability(mdp, CLEAR, left.padded(ROWS, LENGTH), THETA).exact == ()
 
 
 def test_a_feature_of_unreachable_states_is_never_active():
-    mdp = replace(two_rooms(), initial=jnp.array([0.0, 0.0, 0.5, 0.5]))
-    first, second = unidentified_directions(mdp)
-    assert {first.kind, second.kind} == {"never active"}
-    texts = {first.description, second.description}
-    assert any("`in left`" in text and "can be reached" in text for text in texts)
+    (found,) = unidentified_directions(replace(two_rooms(), initial=jnp.array([0.0, 0.0, 0.5, 0.5])))
+    assert found.kind == "never active"
+    assert "`f0` is zero for every state and action that can be reached" in found.description
 
 
 def test_patrols():
