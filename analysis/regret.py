@@ -23,7 +23,7 @@ itself, not its bound.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -116,7 +116,7 @@ class Gaps(NamedTuple):
         return running_mean(self.empirical)
 
 
-def follow(
+def regret_gaps(
     learner: Learner,
     key: Array,
     demonstrations: Demonstration,
@@ -223,7 +223,7 @@ def regret_plot(
     curves: Sequence[RegretCurve],
     *,
     theorem: BoundCurve | None = None,
-    sure: Sequence[BoundCurve] = (),
+    sure: Mapping[str, Float[np.ndarray, " T"]] | None = None,
     burn_in: int = 10,
     coverage: float = 0.8,
     theme: Theme = LIGHT,
@@ -232,15 +232,18 @@ def regret_plot(
     """Average regret against sessions: expected, on log-log axes with fitted slopes, and empirical.
 
     Lines are medians over runs, bands hold ``coverage`` of them; the slope is that of the mean over runs.
+    ``theorem`` is drawn with the expected form, ``sure`` bounds, by the name of their curve, with the other.
     Raises ``ValueError`` for curves of different lengths.
     """
-    lengths = {np.shape(c.expected)[-1] for c in curves} | {len(b.average) for b in sure}
+    bounds = {} if sure is None else sure
+    lengths = {np.shape(c.expected)[-1] for c in curves} | {len(bound) for bound in bounds.values()}
     if len(lengths) != 1:
         raise ValueError(f"the curves must have one number of sessions, got {sorted(lengths)}")
     figure = new_figure(theme, 10.4, 4.6)
     figure.get_layout_engine().set(wspace=0.06)  # type: ignore[union-attr, call-arg]
     left, right = figure.subplots(1, 2)
     handles: list[Line2D] = []
+    surely: list[Line2D] = []
     sessions = np.arange(1, lengths.pop() + 1)
     for i, curve in enumerate(curves):
         slope = log_log_slope(np.mean(curve.expected, axis=0), burn_in)
@@ -249,23 +252,23 @@ def regret_plot(
             band = quantile_band(values, coverage)
             axes.fill_between(sessions, band.low, band.high, color=color, alpha=0.18, linewidth=0)
             axes.plot(sessions, band.median, color=color, linestyle=dashes, linewidth=1.9)
+        if curve.name in bounds:
+            dotted: dict[str, Any] = {"color": color, "linewidth": 1.3, "linestyle": (0, (1, 1.6))}
+            right.plot(sessions, bounds[curve.name], **dotted)
+            surely.append(Line2D([], [], label=f"sure bound, {curve.name}", **dotted))
         label = f"{curve.name}, slope {slope.slope:.2f}"
         handles.append(Line2D([], [], color=color, linestyle=dashes, linewidth=1.9, label=label))
     if theorem is not None:
         style: dict[str, Any] = {"color": theme.muted, "linewidth": 1.4, "linestyle": (0, (1, 1.6))}
         left.plot(sessions, theorem.average, **style)
         handles.append(Line2D([], [], label=theorem.name, **style))
-    for i, bound in enumerate(sure):
-        style = {"color": theme.series[i % len(theme.series)], "linewidth": 1.2, "linestyle": (0, (1, 1.6))}
-        right.plot(sessions, bound.average, **style)
-        handles.append(Line2D([], [], label=bound.name, **style))
     left.set_xscale("log")
     left.set_yscale("log")
     right.set_xscale("log")
     right.axhline(0.0, color=theme.ink, linewidth=0.8)
     _label(left, theme, "Expected: excess risk, never negative")
     _label(right, theme, "Empirical: on the learner's own data")
-    head(figure, theme, handles, title=title, columns=2)
+    head(figure, theme, handles + surely, title=title, columns=3)
     runs = np.shape(curves[0].expected)[0]
     foot(
         figure, theme,

@@ -125,7 +125,7 @@ class Verdict(NamedTuple):
         return float(interval.low), float(interval.high)
 
 
-def judge(
+def judge_stops(
     stops: Int[np.ndarray, " R"], accuracy: Float[np.ndarray, "R T"], margin: float, tail: int
 ) -> Verdict:
     """Judge each stream's stop (a session from 1, or 0 for never) by the definition of a false stop.
@@ -172,7 +172,7 @@ class Sweep(NamedTuple):
         return self.verdicts[int(match[0])]
 
 
-def sweep(
+def sweep_tolerance(
     name: str,
     unit: str,
     rule: Callable[[float], Int[np.ndarray, " R"]],
@@ -183,7 +183,7 @@ def sweep(
 ) -> Sweep:
     """Judge ``rule(rho)`` at every tolerance."""
     values = np.asarray(rho, float)
-    return Sweep(name, unit, values, tuple(judge(rule(x), accuracy, margin, tail) for x in values))
+    return Sweep(name, unit, values, tuple(judge_stops(rule(x), accuracy, margin, tail) for x in values))
 
 
 def stopping_plot(

@@ -198,7 +198,9 @@ class MovingWindow:
     """Against early stopping (chapter 4): the standard deviation over the last ``width`` sessions is small.
 
     ``of`` is the field of the report that must settle within ``tolerance``: ``log_likelihood`` or
-    ``gradient``. Raises ``ValueError`` for another field or a width below 2.
+    ``gradient``. What protects is the width: where nothing is seen everything stands still, so it should
+    exceed the longest stretch of sessions without a sighting. Raises ``ValueError`` for another field or a
+    width below 2.
     """
 
     def __init__(self, width: int, tolerance: float, of: str = "log_likelihood") -> None:

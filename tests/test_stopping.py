@@ -6,13 +6,13 @@ import pytest
 from i2rl.analysis.stopping import (
     NEVER,
     Sweep,
-    judge,
+    judge_stops,
     learning_error_change,
     likelihood_change,
     moving_window,
     policy_window,
     stopping_plot,
-    sweep,
+    sweep_tolerance,
 )
 from i2rl.analysis.style import DARK, LIGHT
 from i2rl.inference import (
@@ -122,21 +122,21 @@ def test_a_stop_is_false_where_the_stream_would_have_become_better():
         [0.2, 0.2, 0.4, 1.0, 1.0],
     ])  # fmt: skip
     stops = np.array([3, 1, 2, NEVER])
-    verdict = judge(stops, accuracy, margin=0.1, tail=2)
+    verdict = judge_stops(stops, accuracy, margin=0.1, tail=2)
     assert (verdict.false_stops, verdict.stops, verdict.runs) == (2, 3, 4)
     assert verdict.used.tolist() == [3, 1, 2, 5]
     assert verdict.false_rate == 0.5
     assert verdict.saved == pytest.approx(1 - 11 / 20)
     assert verdict.loss == pytest.approx((0.15 - 0.4 + 0.8) / 4)
-    assert judge(stops, accuracy, margin=0.2, tail=2).false_stops == 1
+    assert judge_stops(stops, accuracy, margin=0.2, tail=2).false_stops == 1
     low, high = verdict.interval()
     assert 0 < low < 0.5 < high < 1
 
 
 def test_stopping_at_the_end_or_never_is_no_false_stop():
     accuracy = np.linspace(0, 1, 10)[None].repeat(2, axis=0)
-    assert judge(np.array([10, NEVER]), accuracy, 0.0, 1).false_stops == 0
-    assert judge(np.array([10, NEVER]), accuracy, 0.0, 1).saved == 0
+    assert judge_stops(np.array([10, NEVER]), accuracy, 0.0, 1).false_stops == 0
+    assert judge_stops(np.array([10, NEVER]), accuracy, 0.0, 1).saved == 0
 
 
 @pytest.mark.parametrize(
@@ -146,7 +146,7 @@ def test_stopping_at_the_end_or_never_is_no_false_stop():
 )  # fmt: skip
 def test_impossible_judgements_are_refused(stops, margin, tail, message):
     with pytest.raises(ValueError, match=message):
-        judge(np.array(stops), np.zeros((3, 4)), margin, tail)
+        judge_stops(np.array(stops), np.zeros((3, 4)), margin, tail)
 
 
 @pytest.mark.parametrize("theme", [LIGHT, DARK], ids=["light", "dark"])
@@ -155,7 +155,7 @@ def test_the_figure_has_a_line_a_rule(reports, theme):
     accuracy = 1 - 1 / np.arange(1, SESSIONS + 1)[None].repeat(STREAMS, axis=0)
     rules = {"single": lambda x: likelihood_change(likelihood, x),
              "window": lambda x: moving_window(likelihood, 5, x)}  # fmt: skip
-    sweeps = [sweep(n, "nats", r, [0.001, 0.1, 1.0], accuracy, 0.05, 3) for n, r in rules.items()]
+    sweeps = [sweep_tolerance(n, "nats", r, [0.001, 0.1, 1.0], accuracy, 0.05, 3) for n, r in rules.items()]
     assert sweeps[0].at(0.1) is sweeps[0].verdicts[1]
     with pytest.raises(ValueError, match=r"not run at rho = 0.2"):
         sweeps[0].at(0.2)
@@ -171,6 +171,8 @@ def test_the_figure_has_a_line_a_rule(reports, theme):
 
 def test_a_sweep_judges_every_tolerance():
     accuracy = np.array([[0.0, 1.0, 1.0]])
-    one = sweep("at once", "sessions", lambda rho: np.array([int(rho)]), [0, 1, 2], accuracy, 0.1, 1)
+    one = sweep_tolerance(
+        "at once", "sessions", lambda rho: np.array([int(rho)]), [0, 1, 2], accuracy, 0.1, 1
+    )
     assert isinstance(one, Sweep)
     assert [v.false_stops for v in one.verdicts] == [0, 1, 0]

@@ -9,6 +9,10 @@ points) are measured to see whether the verdict hinges on it.
 Two controls. A window of ``w`` sessions cannot fire before session ``w``: ``fixed number`` stops every stream
 after ``n`` sessions without looking. And the single-step rules are the windows' own, of width two in effect.
 
+The width of a window is what decides. For up to 10 sessions on end nothing is in view (the loop has 56
+steps), the learner's quantities stand still for want of data, and a rule that looks at fewer sessions takes
+that for convergence.
+
 Run as ``python -m i2rl.analysis.benchmarks.stopping``; ``--reuse`` judges the streams of the last run again.
 """
 
@@ -41,7 +45,7 @@ from ..stopping import (
     moving_window,
     policy_window,
     stopping_plot,
-    sweep,
+    sweep_tolerance,
 )
 from ..style import save_themes
 from .harness import DEFAULT_FOLDER, print_table, publish
@@ -89,7 +93,7 @@ def sweeps(h: Histories, margin: float) -> dict[str, Sweep]:
     scale = float(h.error.max())
 
     def swept(name: str, unit: str, rule: Callable[[float], np.ndarray], rho: np.ndarray) -> Sweep:
-        return sweep(name, unit, rule, rho, h.accuracy, margin, TAIL)
+        return sweep_tolerance(name, unit, rule, rho, h.accuracy, margin, TAIL)
 
     rows = [
         swept("criterion 1: single step of likelihood", "nats",
