@@ -89,7 +89,7 @@ def _shown(
     return jnp.sum(posterior.pairs, (0, 1, 3)), jnp.einsum("nlsa,nl->s", posterior.pairs, seen)
 
 
-def identifiability(
+def identifiability_of(
     mdp: TabularMDP,
     sensor: Imperfection,
     demonstration: Demonstration,
@@ -145,14 +145,15 @@ def identifiability(
     weak = sparse_basis(axes[:, values < scale**-2], _MINOR)
     # Turned so that the largest coefficient is positive: rising means that its weight rises.
     weak = weak * np.sign(weak[np.argmax(np.abs(weak), axis=0), np.arange(weak.shape[1])])
-    moves = [scale * d for d in weak.T] + [-scale * d for d in weak.T]
-    points = np.stack([theta, 0.5 * theta, 2 * theta, *(theta + move for move in moves)])
+    # As many points as there could be directions, so that one compiled program serves any number.
+    moves = np.zeros((2, mdp.n_features, mdp.n_features))
+    moves[:, : weak.shape[1]] = scale * weak.T, -scale * weak.T
+    points = np.concatenate([theta * np.array([[1.0], [0.5], [2.0]]), theta + moves.reshape(-1, len(theta))])
     totals = total_log_likelihoods(mdp, sensor, jnp.asarray(points), demonstration)
-    base, halved, doubled, *moved = (float(x) for x in totals)
-    losses = list(zip(moved[: weak.shape[1]], moved[weak.shape[1] :], strict=True))
+    _, halved, doubled, *moved = (float(x) for x in totals[0] - totals)
     directions = [
-        _weak(mdp, d, information, (base - ahead, base - back), seen, scale)
-        for d, (ahead, back) in zip(weak.T, losses, strict=True)
+        _weak(mdp, d, information, (along, against), seen, scale)
+        for d, along, against in zip(weak.T, moved, moved[mdp.n_features :], strict=False)
     ]
     return Identifiability(
         mdp.feature_names,
@@ -162,7 +163,7 @@ def identifiability(
         tuple(direction._replace(loss=(0.0, 0.0)) for direction in exact),
         tuple(sorted(directions, key=lambda direction: -direction.standard_error)),
         scale,
-        (base - halved, base - doubled),
+        (halved, doubled),
     )
 
 
@@ -220,7 +221,7 @@ def _sides(loss: tuple[float, float], scale: float) -> str:
 # -- for readers --------------------------------------------------------------------------------------
 
 
-def describe(result: Identifiability) -> str:
+def describe_identifiability(result: Identifiability) -> str:
     """The findings in sentences, one direction a line."""
     lines = [f"{d.kind}: {d.description}." for d in result.exact]
     count = len(result.features)
@@ -242,12 +243,15 @@ def describe(result: Identifiability) -> str:
         ]
     else:
         lines.append(f"These demonstrations determine the others, each to within {result.scale:g}.")
-    halved, doubled = result.length_loss
-    change = f"loses {doubled:.2g}" if doubled > 0 else f"gains {-doubled:.2g}"
-    lines.append(f"Halving all weights loses {halved:.2g} nats of likelihood, doubling them {change}.")
-    if doubled < 0:
-        lines.append("The expert errs too rarely to bound the weights' common length from above.")
-    return "\n".join(lines)
+    return "\n".join([*lines, _length(result)])
+
+
+def _length(result: Identifiability) -> str:
+    halved, doubled = (f"loses {x:.2g}" if x > 0 else f"gains {abs(x):.2g}" for x in result.length_loss)
+    text = f"Halving all weights {halved} nats of likelihood, doubling them {doubled}."
+    if result.length_loss[1] < -1e-9:
+        text += " The expert errs too rarely to bound the weights' common length from above."
+    return text
 
 
 def directions_table(result: Identifiability) -> pd.DataFrame:
@@ -287,11 +291,12 @@ def identifiability_section(results: Mapping[str, Identifiability]) -> Section:
                 (d.kind, "none" if d.exact else f"{d.standard_error:.2g}", d.description)
                 for d in result.directions
             ]
-            tables.append(Table(("kind", "standard error", "direction"), found, f"{title}: undetermined"))
+            caption = f"{title}: directions not determined (without a standard error: by no amount of data)"
+            tables.append(Table(("kind", "standard error", "direction"), found, caption))
     text = (
-        "Behaviour determines a reward only up to changes that leave the behaviour alone. Directions of the "
-        "first kind change nothing anywhere; no amount of watching would tell. The others are determined so "
-        "weakly that prior belief decides: quite different weights explain what was seen as well.\n\n"
-        + "\n\n".join(f"{title}. {' '.join(describe(r).splitlines()[-2:])}" for title, r in results.items())
+        "Behaviour determines a reward only up to changes that leave the behaviour alone. Where a direction "
+        "of the weights changes no behaviour at all, no amount of watching would tell. Where it is weakly "
+        "determined, prior belief decides: quite different weights explain what was seen as well.\n\n"
+        + "\n\n".join(f"{title[:1].upper()}{title[1:]}. {_length(r)}" for title, r in results.items())
     )
     return Section("What the demonstrations determine", text, tables)

@@ -10,9 +10,9 @@ import pytest
 
 from i2rl.analysis import write_report
 from i2rl.analysis.identifiability import (
-    describe,
+    describe_identifiability,
     directions_table,
-    identifiability,
+    identifiability_of,
     identifiability_section,
 )
 from i2rl.analysis.information import (
@@ -247,18 +247,18 @@ def test_what_demonstrations_never_show_is_not_visited():
     mdp = two_rooms()
     assert unidentified_directions(mdp) == ()
     right = Demonstration.from_pairs(np.array([[2, 3, 2], [3, 2, 2]]), np.array([[0, 0, 1], [0, 1, 1]]))
-    result = identifiability(mdp, CLEAR, right.padded(ROWS, LENGTH), THETA)
+    result = identifiability_of(mdp, CLEAR, right.padded(ROWS, LENGTH), THETA)
     assert [d.kind for d in result.exact] == ["not visited"]
     np.testing.assert_allclose(np.abs(result.exact[0].vector), [1, 0], atol=1e-12)
     assert "`f0`" in result.exact[0].description
     assert "2 states that the demonstrations never show, such as s0" in result.exact[0].description
     assert np.isinf(result.standard_errors[0])
     assert np.isfinite(result.standard_errors[1])
-    assert "1 of 2 directions" in describe(result)
+    assert "1 of 2 directions" in describe_identifiability(result)
     section = identifiability_section({"agent": result})
     assert any("not determined" in row for table in section.tables for row in table.rows)
     left = Demonstration.from_pairs(np.array([[0, 1, 0], [1, 3, 2]]), np.array([[0, 0, 1], [1, 0, 1]]))
-    assert identifiability(mdp, CLEAR, left.padded(ROWS, LENGTH), THETA).exact == ()
+    assert identifiability_of(mdp, CLEAR, left.padded(ROWS, LENGTH), THETA).exact == ()
 
 
 def test_a_feature_of_unreachable_states_is_never_active():
@@ -300,7 +300,7 @@ def test_planted_in_patrol_2(kind):
 def patrol_result():
     patrol = instance(2)
     demo = demonstrate(jax.random.key(1), patrol, 30, 60)[0]
-    return patrol, demo, identifiability(patrol.mdp, patrol.visibility(30), demo)
+    return patrol, demo, identifiability_of(patrol.mdp, patrol.visibility(30), demo)
 
 
 def test_patrol_2_gives_no_false_alarm(patrol_result):
@@ -308,7 +308,7 @@ def test_patrol_2_gives_no_false_alarm(patrol_result):
     assert result.exact == ()
     for seed in range(3):
         for demo in demonstrate(jax.random.key(seed), patrol, 30, 60):
-            other = identifiability(patrol.mdp, patrol.visibility(30), demo, result.weights)
+            other = identifiability_of(patrol.mdp, patrol.visibility(30), demo, result.weights)
             assert other.exact == ()
             assert np.isfinite(other.information).all()
 
@@ -337,8 +337,8 @@ def test_weak_directions_are_those_the_likelihood_hardly_bends_along(patrol_resu
 def test_more_of_a_soft_expert_determines_more(random_mdp):
     mdp = small(random_mdp(8))
     shown = sample_demonstration(jax.random.key(0), TrajectoryLaw(mdp, THETA, HALF, LENGTH), 128)
-    few = identifiability(mdp, HALF, shown.select([0]).padded(ROWS, LENGTH), THETA)
-    many = identifiability(mdp, HALF, shown.padded(ROWS, LENGTH), THETA)
+    few = identifiability_of(mdp, HALF, shown.select([0]).padded(ROWS, LENGTH), THETA)
+    many = identifiability_of(mdp, HALF, shown.padded(ROWS, LENGTH), THETA)
     assert few.weak
     assert many.weak == many.exact == few.exact == ()
     np.testing.assert_allclose(
@@ -349,7 +349,7 @@ def test_more_of_a_soft_expert_determines_more(random_mdp):
 def test_nothing_seen_determines_nothing(random_mdp):
     mdp = small(random_mdp(8))
     demo = Demonstration.from_steps([["hidden"] * LENGTH] * 4, mdp).padded(ROWS, LENGTH)
-    result = identifiability(mdp, Visibility(np.zeros(4, bool)), demo, THETA)
+    result = identifiability_of(mdp, Visibility(np.zeros(4, bool)), demo, THETA)
     assert result.exact == ()
     assert len(result.weak) == 2
     assert all(np.isinf(d.standard_error) or d.standard_error > 1e4 for d in result.weak)
@@ -358,7 +358,7 @@ def test_nothing_seen_determines_nothing(random_mdp):
 
 def test_readable(patrol_result, tmp_path):
     _, _, result = patrol_result
-    text, table = describe(result), directions_table(result)
+    text, table = describe_identifiability(result), directions_table(result)
     assert list(table["standard_error"]) == [d.standard_error for d in result.weak]
     assert all(d.description in text for d in result.weak)
     np.testing.assert_allclose(table[list(result.features)].to_numpy(), [d.vector for d in result.weak])
@@ -377,7 +377,7 @@ def test_words():
 def test_errors(random_mdp):
     mdp = random_mdp(0)
     demo = Demonstration.from_pairs(np.array([[0]]), np.array([[0]]))
-    examine = partial(identifiability, mdp, Sensor())
+    examine = partial(identifiability_of, mdp, Sensor())
     with pytest.raises(ValueError, match="no steps"):
         examine(Demonstration.from_pairs(np.zeros((0, 2)), np.zeros((0, 2))))
     with pytest.raises(ValueError, match="scale must be positive, got 0"):

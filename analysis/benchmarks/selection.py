@@ -89,20 +89,20 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=20)
     parser.add_argument("--fragments", type=int, default=60)
-    parser.add_argument("--draws", type=int, default=150, help="of each of two chains")
-    parser.add_argument("--warmup", type=int, default=150)
+    parser.add_argument("--draws", type=int, default=100, help="of each of two chains")
+    parser.add_argument("--warmup", type=int, default=75)
     options = parser.parse_args()
     patrol = instance(2)
     sets, runs = feature_sets(patrol), []
-    for seed in range(options.seeds):
-        for expert in EXPERTS:
+    for expert in EXPERTS:
+        for seed in range(options.seeds):
             began = time.perf_counter()
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore")  # of Pareto shapes, which are reported
                 compared = compare_features(
                     jax.random.fold_in(jax.random.key(seed), EXPERTS.index(expert)), sets,
                     patrol.visibility(OBSERVABILITY), shown(expert, seed, patrol, options.fragments),
-                    draws=options.draws, warmup=options.warmup, chains=2,
+                    draws=options.draws, warmup=options.warmup, chains=2, target_accept=0.8,
                 )  # fmt: skip
                 record = {"expert": expert, "seed": seed, **judge(compared.posteriors)}
             record["seconds"] = time.perf_counter() - began
