@@ -182,7 +182,7 @@ def _row(gaps: Gaps, burn_in: int) -> dict[str, Any]:
     }
 
 
-def _draw(name: str, setting: Setting, measured: dict[str, Gaps], patrol: Patrol, burn_in: int) -> None:
+def _draw(path: Path, setting: Setting, measured: dict[str, Gaps], patrol: Patrol, burn_in: int) -> None:
     curves = [RegretCurve(n, g.regret, g.empirical_regret) for n, g in measured.items()]
     theorem, sure = None, {}
     if setting.convex:
@@ -190,13 +190,13 @@ def _draw(name: str, setting: Setting, measured: dict[str, Gaps], patrol: Patrol
         sizes = [1] * len(main.beta)
         average = no_regret(float(main.beta[0]), sizes, mdp.n_features, float(mdp.discount)).average
         theorem = BoundCurve("Theorem 5 for c = 1: 2Kc H(T) / T", average)
-        sure = {t.name: sure_bound(t.beta, patrol.weights) for t in (main, setting.thresholds[3])}
+        sure = {main.name: sure_bound(main.beta, patrol.weights)}
     save_themes(
         lambda theme: regret_plot(
             curves, theorem=theorem, sure=sure, burn_in=burn_in, theme=theme,
             title=f"Average regret: {setting.title}",
         ),
-        DEFAULT_FOLDER, f"regret-{name}",
+        path.parent, path.name,
     )  # fmt: skip
 
 
@@ -229,7 +229,7 @@ def main(
                 worst = measured[t.name].empirical_regret - sure_bound(t.beta, patrol.weights)
                 rows[t.name]["largest excess over the sure bound"] = float(worst.max())
         results[name] = {"setting": setting.title, "seconds": time.perf_counter() - began, "rows": rows}
-        _draw(name, setting, measured, patrol, burn_in)
+        _draw(path.parent / f"regret-{name}", setting, measured, patrol, burn_in)
         print_table(
             f"{name}: {setting.title}; {runs} streams of {sessions} sessions",
             ("threshold", "slope", "slopes of runs", "late slope", "regret", "last risk", "empirical"),
