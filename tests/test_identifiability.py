@@ -267,6 +267,14 @@ def test_a_feature_of_unreachable_states_is_never_active():
     assert "`f0` is zero for every state and action that can be reached" in found.description
 
 
+def test_features_that_say_nothing_at_all(random_mdp):
+    mdp = random_mdp(0)
+    silent = unidentified_directions(with_features(mdp, np.zeros((4, 3, 2))))
+    assert [d.kind for d in silent] == ["never active"] * 2
+    ones = unidentified_directions(with_features(mdp, np.ones((4, 3, 2))))
+    assert [d.kind for d in ones] == ["duplicate", "constant"]
+
+
 def test_patrols():
     assert unidentified_directions(instance(1).mdp) == ()
     assert unidentified_directions(instance(2).mdp) == ()
