@@ -8,9 +8,9 @@ horizon by the implicit function theorem: no unrolling.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -177,7 +177,7 @@ def _policy_iteration(
         values, q, gap, _, step = carry
         matrix = jnp.eye(mdp.n_states) - mdp.discount * mdp.state_transitions(policy_of(q))
         # Newton's form (correct the values by the residual) keeps rounding errors from accumulating.
-        values = values + jnp.linalg.solve(matrix, gap)
+        values = values + _solve(matrix, gap)
         return values, *residual(values), _largest(gap), step + 1
 
     def unfinished(carry: tuple) -> Bool[Array, ""]:
@@ -280,15 +280,56 @@ def solve_values(
             )
 
         return lax.custom_linear_solve(matvec, rate, iterate, iterate_back)
-    factors = jax.scipy.linalg.lu_factor(
-        jnp.eye(mdp.n_states) - fixed.discount * fixed.state_transitions(fixed_policy)
-    )
+    factors = _factor(jnp.eye(mdp.n_states) - fixed.discount * fixed.state_transitions(fixed_policy))
     return lax.custom_linear_solve(
-        matvec,
-        rate,
-        lambda _, b: jax.scipy.linalg.lu_solve(factors, b),
-        lambda _, b: jax.scipy.linalg.lu_solve(factors, b, trans=1),
+        matvec, rate, lambda _, b: _solve_factored(factors, b), lambda _, b: _solve_transposed(factors, b)
     )
+
+
+def _one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Let a linear solve that is mapped with ``vmap`` run in sequence on a CPU, together elsewhere.
+
+    XLA's batched LAPACK calls share the CPU's few threads with the loops that wait for them; on two cores
+    they end up waiting for each other for ever (seen with jaxlib 0.10). In sequence is also faster there.
+    """
+    alone = jax.custom_batching.custom_vmap(function)
+
+    @alone.def_vmap
+    def mapped(size: int, batched: Sequence[Any], *arguments: Any) -> tuple:
+        def broadcast(x: Array, has_axis: bool) -> Array:
+            return x if has_axis else jnp.broadcast_to(x, (size, *x.shape))
+
+        arguments = tuple(
+            jax.tree.map(broadcast, x, axes) for x, axes in zip(arguments, batched, strict=True)
+        )
+        result = lax.platform_dependent(
+            *arguments,
+            cpu=lambda *xs: lax.map(lambda x: alone(*x), xs),
+            default=jax.vmap(function),
+        )
+        return result, jax.tree.map(lambda _: True, result)
+
+    return alone
+
+
+@_one_by_one
+def _solve(matrix: Float[Array, "S S"], b: Float[Array, " S"]) -> Float[Array, " S"]:
+    return jnp.linalg.solve(matrix, b)
+
+
+@_one_by_one
+def _factor(matrix: Float[Array, "S S"]) -> tuple[Array, Array]:
+    return jax.scipy.linalg.lu_factor(matrix)
+
+
+@_one_by_one
+def _solve_factored(factors: tuple[Array, Array], b: Float[Array, " S ..."]) -> Float[Array, " S ..."]:
+    return jax.scipy.linalg.lu_solve(factors, b)
+
+
+@_one_by_one
+def _solve_transposed(factors: tuple[Array, Array], b: Float[Array, " S ..."]) -> Float[Array, " S ..."]:
+    return jax.scipy.linalg.lu_solve(factors, b, trans=1)
 
 
 def _by_column(function: Callable[[Float[Array, " S"]], Float[Array, " S"]], x: Array) -> Array:
