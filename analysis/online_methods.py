@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
@@ -239,7 +240,8 @@ def _behaviour_accuracy(
         policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, weights)).optimal)
         return policy_accuracy(mdp, optimal, policy).overall
 
-    return jax.vmap(accuracy)(weights)
+    # One after another: batched factorisations may block one another on a CPU with few threads.
+    return lax.map(accuracy, weights)
 
 
 # -- telling ------------------------------------------------------------------------------------------
