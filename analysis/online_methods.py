@@ -240,7 +240,7 @@ def _behaviour_accuracy(
         policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, weights)).optimal)
         return policy_accuracy(mdp, optimal, policy).overall
 
-    # One after another: batched factorisations may block one another on a CPU with few threads.
+    # One after another: batched factorisations may wait for one another on a CPU with few threads.
     return lax.map(accuracy, weights)
 
 
