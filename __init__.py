@@ -2,12 +2,20 @@
 
 The parts are imported when they are used, so that ``import i2rl`` costs nothing:
 :mod:`i2rl.models`, :mod:`i2rl.inference`, :mod:`i2rl.domains`, :mod:`i2rl.analysis`.
+
+Unless ``OPENBLAS_NUM_THREADS`` is set, or SciPy is loaded already (JAX loads it), importing this package asks
+for one linear-algebra thread. Planning factorises small matrices, from several of XLA's threads at once:
+threads of OpenBLAS's own cost up to a hundred times the work there, and have been seen to hang.
 """
 
 import importlib
+import os
 from types import ModuleType
 
 from .version import __version__
+
+# Before anything loads SciPy.
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 __all__ = ["__version__", "analysis", "domains", "inference", "models"]
 

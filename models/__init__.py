@@ -1,14 +1,8 @@
 """What is believed: decision processes, demonstrations, evidence, and the law of a trajectory.
 
 Importing this package switches JAX to 64-bit floats: likelihoods of long trajectories and warm-started
-programs need the digits. Unless ``OPENBLAS_NUM_THREADS`` is set, or SciPy is loaded already, it also asks for
-one linear-algebra thread: planning factorises small matrices, where threads that wait for each other cost up
-to a hundred times the work on a busy machine.
+programs need the digits.
 """
-
-import os
-
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
 import jax
 

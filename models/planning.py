@@ -289,8 +289,9 @@ def solve_values(
 def _one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
     """Let a linear solve that is mapped with ``vmap`` run in sequence on a CPU, together elsewhere.
 
-    XLA's batched LAPACK calls share the CPU's few threads with the loops that wait for them; on two cores
-    they end up waiting for each other for ever (seen with jaxlib 0.10). In sequence is also faster there.
+    XLA makes batched LAPACK calls from several of its threads at once. Where OpenBLAS has threads of its own
+    (SciPy loaded before this package could ask for one), they have been seen to wait for each other for ever
+    (jaxlib 0.10 on two cores); with one thread nothing is lost by going in sequence.
     """
     alone = jax.custom_batching.custom_vmap(function)
 
