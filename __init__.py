@@ -4,8 +4,8 @@ The parts are imported when they are used, so that ``import i2rl`` costs nothing
 :mod:`i2rl.models`, :mod:`i2rl.inference`, :mod:`i2rl.domains`, :mod:`i2rl.analysis`.
 
 Unless ``OPENBLAS_NUM_THREADS`` is set, or SciPy is loaded already (JAX loads it), importing this package asks
-for one linear-algebra thread. Planning factorises small matrices, from several of XLA's threads at once:
-threads of OpenBLAS's own cost up to a hundred times the work there, and have been seen to hang.
+for one linear-algebra thread: planning factorises small matrices, where threads that wait for each other cost
+up to a hundred times the work on a busy machine.
 """
 
 import importlib

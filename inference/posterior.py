@@ -381,7 +381,8 @@ def _inference_data(
         )
     if names:
         groups["constant_data"] = xr.Dataset(names)
-    idata.add_groups(groups)
+    if groups:
+        idata.add_groups(groups)
     return idata
 
 

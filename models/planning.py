@@ -289,9 +289,8 @@ def solve_values(
 def _one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
     """Let a linear solve that is mapped with ``vmap`` run in sequence on a CPU, together elsewhere.
 
-    XLA makes batched LAPACK calls from several of its threads at once. Where OpenBLAS has threads of its own
-    (SciPy loaded before this package could ask for one), they have been seen to wait for each other for ever
-    (jaxlib 0.10 on two cores); with one thread nothing is lost by going in sequence.
+    On two cores, batched LAPACK calls inside compiled loops have been seen to wait for each other for ever
+    (jaxlib 0.10, whatever the number of OpenBLAS's threads); in sequence, never. Nothing is lost by it there.
     """
     alone = jax.custom_batching.custom_vmap(function)
 
