@@ -102,13 +102,24 @@ def fleet(learner: Learner) -> Fleet:
     ``init(key, streams)`` and ``update(states, demonstrations)``, the arrays of a demonstration being
     ``[streams, n, L]``. Raises ``ValueError`` for a learner whose solver runs outside JAX. Observations
     are not checked: an impossible one shows as a demonstration log-likelihood of minus infinity, and leaves
-    its learner's state as it was.
+    its learner's state as it was. On a CPU the streams take turns: lanes of a mapped loop would all wait for
+    the slowest of them, at every level of nested loops.
     """
     if learner.session is None:
         raise ValueError(
             f"{learner.name} solves its programs outside JAX, so it cannot be mapped over streams"
         )
-    update = jax.jit(jax.vmap(learner.session))
+    session = learner.session
+
+    @jax.jit
+    def update(states: Any, demonstrations: Demonstration) -> tuple[Any, Report]:
+        return lax.platform_dependent(
+            states,
+            jax.tree.map(jnp.asarray, demonstrations),
+            cpu=lambda *streams: lax.map(lambda stream: session(*stream), streams),
+            default=jax.vmap(session),
+        )
+
     init = jax.vmap(learner.init)
     return Fleet(lambda key, streams: init(jax.random.split(key, streams)), update)
 
@@ -123,9 +134,8 @@ def run_streams(
 
     ``demonstrations`` holds arrays ``[R, T, n, L]``: ``R`` streams of ``T`` sessions. Returns the final
     states ``[R]`` and what ``keep(state, report)``, a pure function called after each session (the report
-    by default), gave: arrays ``[R, T]``. Streams run one after the other, so that none waits for the
-    slowest, as the mapped programs of :func:`fleet` do; on a CPU that is the faster way. Observations are
-    not checked, as in a fleet; of the keys, stream ``i`` gets that which stream ``i`` of a fleet gets.
+    by default), gave: arrays ``[R, T]``. Streams run one after the other. Observations are not checked,
+    as in a fleet; of the keys, stream ``i`` gets that which stream ``i`` of a fleet gets.
     Raises ``ValueError`` for a learner whose solver runs outside JAX, or arrays of another rank.
     """
     if learner.session is None:
