@@ -93,10 +93,10 @@ def require_posterior(
                 f"the posterior is about another MDP: its fingerprint is {theirs[:12]}, "
                 f"that of the MDP given is {mine[:12]}"
             )
-        names = [str(name) for name in weights["feature"].values]
-        if weights.sizes["feature"] != mdp.n_features or (
-            "feature" in weights.coords and names != list(mdp.feature_names)
-        ):
+        names = weights["feature"].values
+        # Features without names were numbered by ArviZ.
+        unnamed = names.dtype.kind not in "UO" and len(names) == mdp.n_features
+        if not unnamed and [str(name) for name in names] != list(mdp.feature_names):
             raise InferenceDataError(
                 f"the posterior is about the features {_listed(names)}, "
                 f"but the MDP has {_listed(mdp.feature_names)}"
