@@ -43,6 +43,9 @@ _MAX_HALVINGS = 40
 # converged (as IPOPT's tolerances): rounding may stop it in between when the discount is close to 1.
 _TARGET_RESIDUAL = 1e-10
 _ACCEPTED_RESIDUAL = 1e-7
+# Where the quadratic model's steps prove too long, it is damped (Levenberg 1944).
+_LEAST_DAMPING = 1e-2
+_LARGEST_DAMPING = 1e4
 # One step changes no reward by more than this many nats: beyond it the quadratic model says nothing.
 _MAX_REWARD_CHANGE = 50.0
 
@@ -122,7 +125,7 @@ def solve_dual(
     features, initial = shaped_target(mdp, target)
     return _minimise(
         mdp,
-        _LinearObjective(initial, features, None),
+        _LinearObjective(initial, features),
         shaped_slack(mdp, slack),
         jnp.asarray(ridge, float),
         start,
@@ -138,9 +141,9 @@ def fit_counts(
 ) -> Solution:
     """Maximise the likelihood of visits, ``sum N log pi_theta - slack.|theta| - ridge/2 |theta|^2``.
 
-    ``objective`` is minus that, in nats. The same iterations as :func:`solve_dual` with the Fisher
-    information ``sum_s N(s) Cov_{a ~ pi(.|s)} dQ(s, .)`` for a Hessian (the program is not convex: with few
-    counts it may have several stationary points, and the one downhill from the start is returned).
+    ``objective`` is minus that, in nats. The same iterations as :func:`solve_dual`, with the convex part of
+    the Hessian (the program is not convex: with few counts it may have several stationary points, and one
+    downhill from the start is returned).
 
     Parameters
     ----------
@@ -178,13 +181,12 @@ def soft_values(
 class _LinearObjective(NamedTuple):
     """``g(theta) = state_weights . V_theta - features . theta``; both programs have this shape.
 
-    ``information [S]`` weighs the covariances in the Hessian; None stands for the discounted occupancy
-    that flows from ``state_weights``, which makes the Hessian exact.
+    Its Hessian is ``sum_s x(s) Cov_{a ~ pi(.|s)} dQ(s, .)``, ``x`` the discounted occupancy that flows from
+    ``state_weights``.
     """
 
     state_weights: Float[Array, " S"]
     features: Float[Array, " K"]
-    information: Float[Array, " S"] | None
 
 
 def count_objective(mdp: TabularMDP, counts: ArrayLike) -> _LinearObjective:
@@ -194,11 +196,9 @@ def count_objective(mdp: TabularMDP, counts: ArrayLike) -> _LinearObjective:
         raise ValueError(
             f"counts must have shape [S, A] = {list(mdp.available.shape)}, got {list(counts.shape)}"
         )
-    visits = counts.sum(1)
     return _LinearObjective(
-        visits - mdp.discount * mdp.push_forward(counts),
+        counts.sum(1) - mdp.discount * mdp.push_forward(counts),
         jnp.einsum("sa,sak->k", counts, mdp.features),
-        visits,
     )
 
 
@@ -217,9 +217,9 @@ def _expand(
     q = mdp.features @ weights + mdp.discount * mdp.expect_next(values)
     policy = jax.nn.softmax(jnp.where(mdp.available, q, -jnp.inf), axis=1)
     to_go = features_to_go(mdp, policy)
-    information = objective.information
-    if information is None:
-        information = occupancy(mdp, policy, objective.state_weights).sum(1)
+    # Visits that are not the policy's own leave negative occupancies somewhere. Without them the model stays
+    # convex, and above the objective to second order.
+    information = jnp.maximum(occupancy(mdp, policy, objective.state_weights).sum(1), 0.0)
     next_to_go = jax.vmap(mdp.expect_next, in_axes=1, out_axes=2)(to_go)
     deviation = (mdp.features + mdp.discount * next_to_go - to_go[:, None]).reshape(-1, mdp.n_features)
     weighted = (information[:, None] * policy).reshape(-1, 1) * deviation
@@ -246,6 +246,7 @@ class _Iterate(NamedTuple):
     objective: Float[Array, ""]
     expansion: _Expansion
     residual: Float[Array, ""]
+    damping: Float[Array, ""]
     iterations: Int[Array, ""]
     finished: Bool[Array, ""]
 
@@ -281,16 +282,18 @@ def _minimise(
         weights: Float[Array, " K"],
         values: Float[Array, " S"],
         value: Float[Array, ""],
+        damping: Float[Array, ""],
         iterations: Int[Array, ""],
     ) -> _Iterate:
         at = _expand(mdp, objective, weights, values)
         residual = _kkt_residual(at.gradient + ridge * weights, slack, weights)
         relative = residual / jnp.where(at.scale > 0, at.scale, 1.0)
-        return _Iterate(weights, values, value, at, relative, iterations, relative <= _TARGET_RESIDUAL)
+        finished = relative <= _TARGET_RESIDUAL
+        return _Iterate(weights, values, value, at, relative, damping, iterations, finished)
 
     def step(now: _Iterate) -> _Iterate:
         at = now.expansion
-        curvature = at.hessian + ridge * jnp.eye(mdp.n_features)
+        curvature = at.hessian + jnp.diag(ridge + now.damping * jnp.diag(at.hessian))
         slope = at.gradient + ridge * now.weights
         move = quadratic_l1(curvature, slope, slack, now.weights, 1e-12 * at.scale) - now.weights
         change = slope @ move + slack @ (jnp.abs(now.weights + move) - jnp.abs(now.weights))
@@ -314,7 +317,12 @@ def _minimise(
 
         none = _Trial(first, now.weights, now.values, now.objective, jnp.array(False), jnp.array(-1))
         trial = lax.while_loop(rejected, attempt, none)
-        new = arrive(trial.weights, trial.values, trial.objective, now.iterations + 1)
+        damping = jnp.where(
+            trial.halvings > 0,
+            jnp.clip(now.damping * 4.0, _LEAST_DAMPING, _LARGEST_DAMPING),
+            jnp.where(now.damping > _LEAST_DAMPING, now.damping / 4.0, 0.0),
+        )
+        new = arrive(trial.weights, trial.values, trial.objective, damping, now.iterations + 1)
         # A predicted change lost in rounding that no longer improves the residual is the end of the road.
         worse = ~(new.residual < now.residual)
         stuck = ~trial.accepted | (worse & (jnp.abs(change) <= noise))
@@ -329,7 +337,7 @@ def _minimise(
     else:
         weights, values = jnp.asarray(start.weights, float), jnp.asarray(start.values, float)
     values, value = evaluate(weights, values)
-    final = lax.while_loop(unfinished, step, arrive(weights, values, value, jnp.array(0)))
+    final = lax.while_loop(unfinished, step, arrive(weights, values, value, jnp.zeros(()), jnp.array(0)))
     return Solution(
         final.weights,
         final.values,

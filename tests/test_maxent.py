@@ -217,7 +217,7 @@ def test_gradient_and_hessian_are_those_of_the_dual():
     def dual(w):
         return target.start @ soft_values(mdp, w) - target.features @ w
 
-    objective = _LinearObjective(target.start, target.features, None)
+    objective = _LinearObjective(target.start, target.features)
     expansion = _expand(mdp, objective, weights, soft_values(mdp, weights))
     np.testing.assert_allclose(expansion.gradient, jax.grad(dual)(weights), rtol=1e-8)
     np.testing.assert_allclose(expansion.hessian, jax.hessian(dual)(weights), rtol=1e-8)
@@ -236,6 +236,36 @@ def test_fisher_information_is_the_hessian_where_the_counts_are_the_policy_s_own
     expansion = _expand(mdp, objective, weights, soft_values(mdp, weights))
     np.testing.assert_allclose(expansion.hessian, jax.hessian(loss)(weights), rtol=1e-7)
     np.testing.assert_allclose(expansion.gradient, 0, atol=1e-8)
+
+
+def test_the_quadratic_model_of_counts_is_convex_and_never_flatter_than_the_likelihood():
+    mdp, flatter = problem(1), 0
+    for seed in range(20):
+        pairs = np.argwhere(mdp.available)
+        counts = np.zeros(mdp.available.shape)
+        counts[tuple(pairs[seed % len(pairs)])] = 1.0
+        objective = count_objective(mdp, counts)
+        weights = jnp.asarray(4 * random_weights(seed))
+
+        def loss(w, objective=objective):
+            return objective.state_weights @ soft_values(mdp, w) - objective.features @ w
+
+        model = _expand(mdp, objective, weights, soft_values(mdp, weights)).hessian
+        exact = jax.hessian(loss)(weights)
+        assert np.linalg.eigvalsh(model).min() >= -1e-10
+        assert np.linalg.eigvalsh(model - exact).min() >= -1e-8
+        flatter += np.linalg.eigvalsh(exact).min() < -1e-3
+    assert flatter > 0  # the likelihood itself is not concave: the model is needed
+
+
+def test_a_few_visits_are_fitted_to_convergence():
+    mdp = problem(1)
+    for seed in range(30):
+        rng = np.random.default_rng(seed)
+        counts = rng.poisson(0.3, mdp.available.shape) * np.asarray(mdp.available)
+        start = WarmStart(jnp.asarray(3 * random_weights(seed)), jnp.zeros(mdp.n_states))
+        solution = fit_counts(mdp, counts, 1e-3, start=start)
+        assert solution.converged, seed
 
 
 minimise_quadratic = jax.jit(quadratic_l1)
