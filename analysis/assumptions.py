@@ -46,8 +46,12 @@ class Bound(NamedTuple):
     confidence : float
         The probability with which it holds, ``max(0, 1 - delta)``.
     epsilon : float
-        The relaxation of the program that the theorem is about (``slack`` of a learner).
+        The relaxation of the program that the theorem is about (``slack`` of a learner), in the last session
+        where it changes.
     assumptions : tuple of Assumption
+    schedule : str
+        How the relaxation changes from session to session, as a learner's configuration describes it; empty
+        where it does not.
     """
 
     source: str
@@ -56,6 +60,7 @@ class Bound(NamedTuple):
     confidence: float
     epsilon: float
     assumptions: tuple[Assumption, ...]
+    schedule: str = ""
 
     @property
     def violated(self) -> tuple[Assumption, ...]:
@@ -109,6 +114,9 @@ SOFT_EXPERT = Assumption("soft_expert", "the expert acts by the soft policy of i
 INDEPENDENT = Assumption("independent", "trajectories are independent and equally distributed")
 WHOLE = Assumption("whole", "trajectories are so long that discounting leaves nothing beyond their end")
 PROGRAM = Assumption("program", "the features statistic is kept, with slack epsilon")
+DIMINISHING = Assumption(
+    "program", "the features statistic is kept, with slack c / i in session i (Harmonic)"
+)
 SOLVED = Assumption("solved", "the maximum-entropy program was solved within its slack")
 COMPLETION = Assumption(
     "completion", "completed features are within epsilon_s of the fully observed ones as often as sampled "
@@ -182,7 +190,7 @@ def check(
             f"epsilon is {bound.epsilon:.3g}",
         )
     if learner is not None:
-        found["program"] = _theorems_program(learner, bound.epsilon)
+        found["program"] = _theorems_program(learner, bound)
         if state is not None:
             found |= _of_run(learner, state, bound.epsilon)
     return bound._replace(
@@ -210,11 +218,13 @@ def _soft(mdp: TabularMDP, weights: np.ndarray, expert: np.ndarray) -> tuple[boo
     )
 
 
-def _theorems_program(learner: Learner, epsilon: float) -> tuple[bool, str]:
+def _theorems_program(learner: Learner, bound: Bound) -> tuple[bool, str]:
     statistic = learner.configuration.get("statistic")
     if statistic != "features":
         return False, f"{learner.name} keeps the {statistic!r} statistic"
-    slack = learner.configuration.get("slack")
+    slack, epsilon = learner.configuration.get("slack"), bound.epsilon
+    if bound.schedule:
+        return slack == bound.schedule, f"its slack is {slack}, the theorem's {bound.schedule}"
     if not isinstance(slack, int | float):
         return False, f"{learner.name} has the slack {slack}, not {epsilon:.4g} in every session"
     return bool(np.isclose(slack, epsilon, rtol=1e-6)), f"its slack is {slack:.4g}, epsilon is {epsilon:.4g}"

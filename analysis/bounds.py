@@ -28,8 +28,10 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
 
+from ..inference.schedule import Harmonic, described
 from .assumptions import (
     COMPLETION,
+    DIMINISHING,
     EXPERT,
     FEATURES,
     FULL_VIEW,
@@ -165,8 +167,9 @@ def lme_i2rl_confidence(
 class Regret(NamedTuple):
     """Theorem 5's bound on the average regret after each session.
 
-    ``average [T]`` is ``2 K c / T sum_{i <= T} 1 / i`` nats, ``confidence [T]`` the probability that it
-    holds for all sessions up to ``T``, and ``bound`` the statement after the last session.
+    ``average [T]`` is ``2 K c / T sum_{i <= T} 1 / i`` nats, ``confidence [T]`` the probability with which
+    the theorem says that it holds for all sessions up to ``T``, and ``bound`` the statement after the last
+    session, with the confidence of the union bound, ``max(0, 1 - sum_i delta_i)``.
     """
 
     average: Float[np.ndarray, " T"]
@@ -180,11 +183,13 @@ def no_regret(
     """Theorem 3 (chapter 4), Theorem 5 (appendix B): average regret with ``epsilon_i / (1 - gamma) = c / i``.
 
     ``Regret_T <= 2 K c H_T / T`` with probability at least ``prod_i max(0, 1 - delta_i)``, ``delta_i = 2 K
-    exp(-2 |X_{1:i}| epsilon_i^2)``. Two corrections: ``H_T = sum 1 / i`` is larger than the ``log T`` of the
-    proof (by 0.577 in the limit); and with sessions of one size ``m``, ``|X_{1:i}| epsilon_i^2 = m c^2
-    (1 - gamma)^2 / i`` goes to zero, so ``delta_i`` goes to ``2 K`` and the confidence is 0 from some session
-    on, whatever ``c``. Sessions have to grow, see :func:`no_regret_sizes`. What survives is
-    :func:`sure_gap`: the regret on the learner's own data is at most half of this bound surely.
+    exp(-2 |X_{1:i}| epsilon_i^2)``. Three corrections: ``H_T = sum 1 / i`` exceeds the ``log T`` of the
+    proof (by 0.577 in the limit); the product is that of independent events, which sessions that share their
+    data are not, so that ``bound`` is quoted with ``1 - sum_i delta_i``; and with sessions of one size ``m``,
+    ``|X_{1:i}| epsilon_i^2 = m c^2 (1 - gamma)^2 / i`` goes to zero, so ``delta_i`` goes to ``2 K`` and the
+    confidence is 0 from some session on, whatever ``c``. Sessions have to grow, see :func:`no_regret_sizes`.
+    What survives is :func:`sure_gap`: the regret on the learner's own data is at most half of this bound
+    surely.
 
     ``session_sizes [T]`` are the trajectories of each session.
     """
@@ -199,15 +204,16 @@ def no_regret(
         "Theorem 3 (Theorem 5 of appendix B)",
         "average regret <= 2 K c H_T / T",
         float(average[-1]),
-        float(confidence[-1]),
+        max(0.0, 1 - float(delta.sum())),
         float(epsilon[-1]),
-        (*EXPERT, FULL_VIEW, *PROGRAM_SOLVED),
+        (*EXPERT, FULL_VIEW, DIMINISHING, SOLVED),
+        str(described(Harmonic(c))),
     )
     return Regret(average, confidence, bound)
 
 
 def no_regret_sizes(c: float, sessions: int, delta: float, n_features: int, discount: float) -> np.ndarray:
-    """Session sizes with which Theorem 5's confidence is ``1 - delta`` for ever, integer ``[T]``.
+    """Session sizes with which Theorem 5's confidence is at least ``1 - delta`` for ever, integer ``[T]``.
 
     The failure probability is spent as ``delta_i = 6 delta / (pi i)^2``, so that ``|X_{1:i}| >=
     i^2 log(2 K / delta_i) / (2 c^2 (1 - gamma)^2)``: sessions grow about linearly.
@@ -340,6 +346,7 @@ def rimeo_no_regret(
     ``session_samples [T]`` are the draws ``n_s`` of each session. The remark on growing sessions at
     :func:`no_regret` applies to all three.
     """
+    _counted("predicates", perception.predicates), _counted("longest", perception.longest)
     plain = no_regret(c, session_sizes, n_features, discount)
     i = np.arange(1, len(plain.average) + 1)
     third = c * (1 - discount) / i / 3
@@ -356,8 +363,8 @@ def rimeo_no_regret(
     confidence = np.cumprod(np.maximum(0.0, 1 - delta))
     bound = plain.bound._replace(
         source="Theorem 7 of appendix E",
-        confidence=float(confidence[-1]),
-        assumptions=(*EXPERT, COMPLETION, OBSERVATION, PREDICATES_SEEN, *PROGRAM_SOLVED),
+        confidence=max(0.0, 1 - float(delta.sum())),
+        assumptions=(*EXPERT, COMPLETION, OBSERVATION, PREDICATES_SEEN, DIMINISHING, SOLVED),
     )
     return Regret(plain.average, confidence, bound)
 
@@ -442,7 +449,9 @@ def observed_size(deviations: Float[np.ndarray, " K"], error: float, confidence:
         raise ValueError(f"deviations of averages in [0, 1] lie in [0, 0.5], got {spread}")
     delta = (1 - _probability("confidence", confidence)) / len(spread)
     _positive("error", error)
-    return smallest(lambda n: np.mean([predictable_half_width(x, n, delta) for x in spread]) <= error)
+    values, counts = np.unique(spread, return_counts=True)
+    share = counts / len(spread)
+    return smallest(lambda n: share @ [predictable_half_width(x, n, delta) for x in values] <= error)
 
 
 def demonstrations_needed(

@@ -17,12 +17,14 @@ _SYMBOLS = {True: "holds", False: "does not hold", None: "yours to answer for"}
 
 
 class Answer(NamedTuple):
-    """Trajectories by bound, the theorem's bound at its own number, and what knowing nothing achieves.
+    """Trajectories by bound for one ``confidence``, the theorem's bound at its own number of them, and what
+    knowing nothing achieves.
 
     Where the expert is known, ``ignorance_nats`` is the expected log-likelihood gap of zero weights, and
     ``informative`` the trajectories from which on each bound promises less than that.
     """
 
+    confidence: float
     table: pd.DataFrame
     bound: Bound
     ignorance_nats: float | None = None
@@ -45,6 +47,9 @@ def answer(
     against it. Raises ``ValueError`` for numbers out of range, for neither ``features`` nor ``mdp``, and for
     both ``mdp`` and something that it decides.
     """
+    for name, error in (("epsilon", epsilon), ("epsilon-s", epsilon_s)):
+        if error >= 1:
+            raise ValueError(f"{name} is the error of an average of values in [0, 1]: below 1, got {error}")
     if mdp is None:
         if features is None:
             raise ValueError("say how many features the reward has (--features), or name a domain (--mdp)")
@@ -53,7 +58,7 @@ def answer(
         table = demonstrations_needed(
             features, epsilon, confidence, gamma, epsilon_s=epsilon_s, deviations=spread
         )
-        return Answer(table, _theorem(table, epsilon, epsilon_s, features, gamma))
+        return Answer(confidence, table, _theorem(table, epsilon, epsilon_s, features, gamma))
     if features is not None or discount is not None or deviation is not None:
         raise ValueError("--mdp decides the features, the discount and their deviation: leave those out")
     return _of_patrol(mdp, epsilon, confidence, epsilon_s)
@@ -83,7 +88,7 @@ def _of_patrol(name: str, epsilon: float, confidence: float, epsilon_s: float) -
     informative = demonstrations_needed(
         process.n_features, half, confidence, gamma, epsilon_s=half, deviations=spread
     )
-    return Answer(table, bound, ignorance, informative)
+    return Answer(confidence, table, bound, ignorance, informative)
 
 
 def _theorem(table: pd.DataFrame, epsilon: float, epsilon_s: float, features: int, discount: float) -> Bound:
@@ -94,6 +99,8 @@ def _theorem(table: pd.DataFrame, epsilon: float, epsilon_s: float, features: in
 def summary(answer: Answer) -> dict[str, Any]:
     """The answer as plain numbers and words, for JSON."""
     return {
+        "confidence": answer.confidence,
+        "violated": [a.name for a in answer.bound.violated],
         "bounds": answer.table.reset_index().to_dict("records"),
         "theorem": {"source": answer.bound.source, "confidence": answer.bound.confidence},
         "assumptions": [a._asdict() for a in answer.bound.assumptions],
@@ -118,8 +125,8 @@ def print_answer(answer: Answer, console: Console) -> None:
         table.add_row(names.get(row.Index, row.Index), str(row.trajectories), draws)
     console.print(table)
     console.print(
-        f"Each for LL(theta_E) - LL(theta) <= {error:.4g} nats per trajectory with probability "
-        f"{bound.confidence:.3f}.\n"
+        f"Each for LL(theta_E) - LL(theta) <= {error:.4g} nats per trajectory with probability at "
+        f"least {answer.confidence:g}.\n"
         "Exact completion: of the hidden steps, under weights as good as the expert's.\n"
         "Observed spread: a plan; the guarantee is the bound computed from the data (observed_bound)."
     )
@@ -130,6 +137,12 @@ def print_answer(answer: Answer, console: Console) -> None:
             "above that promises nothing.\nTo promise as much takes "
             f"{needed['theorem']} trajectories by the theorem, {needed['exact completion']} with exact "
             f"completion, {needed['observed spread']} with the observed spread."
+        )
+    if bound.violated:
+        console.print(
+            "None of this is a guarantee here: it does not hold that "
+            + ", nor that ".join(a.statement for a in bound.violated)
+            + "."
         )
     assumed = Table(title="What is assumed")
     assumed.add_column("assumption")

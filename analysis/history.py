@@ -186,7 +186,8 @@ def _history(
             np.asarray(policy).reshape(*last.shape[:-1], *policy.shape[1:]),
         ),
     }
-    for name, value in ({} if statistic is None else statistic._asdict()).items():
+    # A method without a statistic, such as DARKO, carries on an empty tuple.
+    for name, value in (statistic._asdict() if statistic else {}).items():
         array = np.asarray(value)
         learned[name] = ((*streams, *_trailing(name, array.ndim - len(streams), _STATISTIC_DIMS)), array)
     groups: dict[str, Any] = {"sessions": group(sessions), "learned": group(learned)}

@@ -95,7 +95,7 @@ def described(slack: Any) -> float | str:
     examined (to 10 digits) are one.
     """
     if not callable(slack):
-        return slack
+        return slack if isinstance(slack, int | float) else float(slack)
     if isinstance(slack, Harmonic):
         return f"Harmonic(c={float(slack.c)!r})"
     digits = [f"{x:.10g}" for x in _values(slack)]

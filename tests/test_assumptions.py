@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from i2rl.analysis.assumptions import BoundNotGuaranteed, check
-from i2rl.analysis.bounds import lme_i2rl_confidence, me_i2rl_confidence
+from i2rl.analysis.bounds import lme_i2rl_confidence, me_i2rl_confidence, no_regret
 from i2rl.domains import instance
-from i2rl.inference import lme_i2rl, me_i2rl, run_sessions
+from i2rl.inference import Harmonic, lme_i2rl, me_i2rl, run_sessions
 from i2rl.models import Sensor, TrajectoryLaw, Visibility, reward_of, sample_demonstration, soft_plan
 
 EVERYTHING = dict.fromkeys(("features", "weights", "soft_expert", "independent", "whole", "full_view"), True)
@@ -98,6 +98,22 @@ def test_another_statistic_or_slack_is_not_the_theorems_program(random_mdp):
         assert _holds(checked, "program") is False
     right = lme_i2rl(mdp, sensor, statistic="features", slack=0.15)
     assert _holds(check(bound, learner=right), "program") is True
+
+
+def test_the_no_regret_theorem_is_about_the_harmonic_schedule(random_mdp):
+    mdp = random_mdp(1)
+    bound = no_regret(2.0, [1000] * 3, mdp.n_features, float(mdp.discount)).bound
+    for slack, answer in ((Harmonic(2.0), True), (Harmonic(3.0), False), (0.1, False)):
+        learner = me_i2rl(mdp, statistic="features", slack=slack)
+        assert _holds(check(bound, learner=learner), "program") is answer
+
+
+def test_a_slack_that_is_an_array_is_the_number_it_holds(random_mdp):
+    mdp = random_mdp(1)
+    bound = me_i2rl_confidence(8, 0.1, mdp.n_features, float(mdp.discount))
+    learner = me_i2rl(mdp, statistic="features", slack=jnp.asarray(0.1))
+    assert _holds(check(bound, learner=learner), "program") is True
+    assert learner.signature == me_i2rl(mdp, statistic="features", slack=0.1).signature
 
 
 def test_what_cannot_be_checked_together_is_refused(random_mdp):

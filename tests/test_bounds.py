@@ -134,6 +134,15 @@ def test_growing_sessions_keep_the_no_regret_theorems_confidence():
     assert smaller.confidence[-1] < 0.9
 
 
+def test_the_regret_is_quoted_with_the_union_bound_since_sessions_share_data():
+    sizes, epsilon = np.array([40, 40, 40]), 5.0 * 0.1 / np.arange(1, 4)
+    regret = no_regret(5.0, sizes, 4, 0.9)
+    deltas = [failure_probability(n, e, 4) for n, e in zip(np.cumsum(sizes), epsilon, strict=True)]
+    assert regret.bound.confidence == pytest.approx(1 - sum(deltas))
+    assert regret.confidence[-1] == pytest.approx(np.prod([1 - d for d in deltas]))
+    assert 0 < regret.bound.confidence < regret.confidence[-1]
+
+
 def test_the_regret_bound_sums_the_theorems_bound_over_sessions():
     regret = no_regret(5.0, [10] * 30, 4, 0.9)
     each = [me_i2rl_confidence(1, 5.0 * 0.1 / i, 4, 0.9).error for i in range(1, 31)]

@@ -396,11 +396,27 @@ def test_bounds_of_a_domain_checks_what_it_can_and_says_what_is_worth_nothing():
     assert content["informative"]["theorem"] > content["informative"]["observed spread"] > 240
 
 
+def test_bounds_of_an_expert_outside_the_theorem_says_that_nothing_is_guaranteed():
+    asked = ["bounds", "--mdp", "patrol3"]
+    told = " ".join(CliRunner().invoke(app, asked).output.split())
+    assert (
+        "None of this is a guarantee here: it does not hold that the expert's weights lie in [0, 1]^K."
+        in told
+    )
+    assert json.loads(CliRunner().invoke(app, [*asked, "--json"]).stdout)["violated"] == ["weights"]
+
+
+def test_bounds_states_the_confidence_that_was_asked_for():
+    told = CliRunner().invoke(app, ["bounds", "--features", "6", "--epsilon", "0.9", "--confidence", "0.8"])
+    assert "with probability at least 0.8." in " ".join(told.output.split())
+
+
 @pytest.mark.parametrize(
     ("options", "message"),
     [
         (["--features", "6", "--confidence", "1.2"], "confidence must lie strictly between 0 and 1, got 1.2"),
         (["--features", "6", "--epsilon", "-0.1"], "epsilon must be positive, got -0.1"),
+        (["--features", "6", "--epsilon", "1"], "epsilon is the error of an average of values in [0, 1]"),
         (["--features", "0"], "n_features must be at least 1, got 0"),
         (["--features", "6", "--deviation", "0.7"], "deviations of averages in [0, 1] lie in [0, 0.5]"),
         ([], "say how many features the reward has"),

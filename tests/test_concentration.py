@@ -13,6 +13,7 @@ from i2rl.analysis.concentration import (
     hoeffding_error,
     hoeffding_size,
     predictable_bernstein,
+    predictable_half_width,
     predictable_size,
 )
 
@@ -109,6 +110,23 @@ def test_the_planned_size_gives_the_planned_interval(mean, deviation, error):
     n = predictable_size(deviation, error, 0.02)
     values = _betas(np.random.default_rng(8), mean, deviation, (200, n, 1))
     assert np.median(predictable_bernstein(values, 0.02).half_width) == pytest.approx(error, rel=0.1)
+
+
+@pytest.mark.parametrize("deviation", [0.0, 0.1, 0.5])
+def test_the_planned_half_width_is_the_sum_over_single_values(deviation):
+    """Blocks of late values and closed forms of the cumulative sums against adding up one by one."""
+    n, delta = 50_000, 0.03
+    squares = [deviation**2 + (deviation**2 * (t - 1) + 0.25) / t**2 for t in range(1, n + 1)]
+    known = (0.25 + np.concatenate([[0.0], np.cumsum(squares)[:-1]])) / np.arange(1, n + 1)
+    bets = np.minimum(np.sqrt(2 * np.log(2 / delta) / (known * n)), 0.75)
+    cost = (-np.log1p(-bets) - bets) @ squares
+    expected = (np.log(2 / delta) + cost) / bets.sum()
+    assert predictable_half_width(deviation, n, delta) == pytest.approx(expected, rel=1e-6)
+
+
+def test_a_tiny_error_is_planned_for_at_once():
+    # In the limit the interval is that of the normal approximation with the sub-Gaussian quantile.
+    assert predictable_size(0.2, 1e-8, 0.03) == pytest.approx(2 * 0.04 * np.log(2 / 0.03) / 1e-16, rel=1e-3)
 
 
 def test_values_that_vary_little_need_fewer_trajectories():

@@ -10,7 +10,16 @@ import numpy as np
 import pytest
 
 from i2rl.analysis.history import fleet_history, provenance, run_history
-from i2rl.inference import CountStatistic, FeatureStatistic, Learner, Report, fleet, run_sessions
+from i2rl.inference import (
+    CountStatistic,
+    FeatureStatistic,
+    Learner,
+    Report,
+    darko_i2rl,
+    fleet,
+    jin_i2rl,
+    run_sessions,
+)
 from i2rl.inference.statistic import blend
 from i2rl.models import TrajectoryLaw, sample_demonstration
 from i2rl.models.evidence import Sensor
@@ -186,3 +195,12 @@ def test_what_is_no_history_is_refused(learner, run):
     wide = [report._replace(weights=np.zeros(5)) for report in run.reports]
     with pytest.raises(ValueError, match=r"must have shape \(2,\), one for each feature, got \(5,\)"):
         run_history(learner, wide)
+
+
+@pytest.mark.parametrize("make", [jin_i2rl, darko_i2rl])
+def test_methods_without_a_statistic_have_histories_too(mdp, demonstration, make):
+    learner = make(mdp)
+    history = run_history(learner, run_sessions(learner, demonstration.sessions(2), key=jax.random.key(1)))
+    assert history["sessions"].sizes == {"session": SESSIONS, "feature": learner.mdp.n_features}
+    assert set(history["learned"].data_vars) == {"weights", "soft_policy"}
+    assert list(history["sessions"]["feature"].values) == list(learner.mdp.feature_names)
