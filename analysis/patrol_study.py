@@ -31,6 +31,7 @@ from .figures import (
     learning_time,
     success_rates,
 )
+from .identifiability import Identifiability, identifiability_of, identifiability_section
 from .maps import hidden_path, policy_map
 from .metrics import demonstration_log_likelihoods, evaluate
 from .report import Picture, Section, Table, write_report
@@ -91,6 +92,7 @@ class Study(NamedTuple):
     methods: tuple[MethodResult, ...]
     batch_rerun_seconds: np.ndarray | None
     stretch: Stretch
+    determined: tuple[Identifiability, ...]
 
 
 class Stretch(NamedTuple):
@@ -150,8 +152,16 @@ def study(
         results.append(_evaluated(patrol, observability, name, learned, keys, sessions, trials))
     first = results[0]
     stretch = _stretch(jax.random.fold_in(keys[0], 7), patrol, observability, first.weights[0, 0, -1])
+    # What the first run's demonstrations say of each patroller, where something was learned from them.
+    known = data[0] if first.name not in (RANDOM, TRUE) else ()
+    determined = tuple(
+        identifiability_of(patrol.mdp, view, demonstration, jnp.asarray(weights[-1]))
+        for demonstration, weights in zip(known, first.weights[0], strict=False)
+    )
     advance("done", 1.0)
-    return Study(patrol, observability, sessions, trials, runs, seed, tuple(results), rerun, stretch)
+    return Study(
+        patrol, observability, sessions, trials, runs, seed, tuple(results), rerun, stretch, determined
+    )
 
 
 class _Learned(NamedTuple):
@@ -430,4 +440,12 @@ def write(study: Study, folder: Path | str) -> Path:
         pictures.append(Picture(light, dark, caption, description))
     table = Table(_HEADINGS, _cells(study), _CAPTION)
     (folder / "results.json").write_text(json.dumps(summary(study), indent=2) + "\n")
-    return write_report(folder, [Section(_title(study), "", [table], pictures)], title="Patrol")
+    sections = [Section(_title(study), "", [table], pictures)]
+    if study.determined:
+        names = (
+            ("the patroller",)
+            if len(study.determined) == 1
+            else ("the first patroller", "the second patroller")
+        )
+        sections.append(identifiability_section(dict(zip(names, study.determined, strict=True))))
+    return write_report(folder, sections, title="Patrol")
