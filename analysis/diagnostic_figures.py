@@ -73,8 +73,9 @@ def weights_by_session(
         axes.axhline(0, color=theme.muted, linewidth=0.8)
         if learned is not None:
             axes.plot(learned["session"], learned[:, k], color=theme.series[2], linewidth=1.5, zorder=3)
-        axes.vlines(sessions, *(x.isel(feature=k) for x in outer), color=color, linewidth=1.6, zorder=4)
-        axes.vlines(sessions, *(x.isel(feature=k) for x in inner), color=color, linewidth=4.5, zorder=4)
+        for (low, high), linewidth in ((outer, 1.6), (inner, 4.5)):
+            ends = low.isel(feature=k), high.isel(feature=k)
+            axes.vlines(sessions, *ends, color=color, linewidth=linewidth, zorder=4)
         axes.plot(
             sessions, median.isel(feature=k), color=color, linewidth=0.9, linestyle=(0, (2, 2)), marker="o",
             markersize=6.5, markerfacecolor=theme.surface, markeredgewidth=1.7, zorder=5,
@@ -229,8 +230,8 @@ def convergence_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: st
     left.plot(table["r_hat"], y, marker="o", color=theme.series[0], **dots)
     if not table["r_hat"].notna().any():
         left.text(0.5, 0.5, "needs two chains", transform=left.transAxes, ha="center", color=theme.ink)
-    left.set_xlim(min(0.999, table["r_hat"].min() - 0.001) if table["r_hat"].notna().any() else 0.999,
-                  max(_RHAT + 0.002, table["r_hat"].max() * 1.001 if table["r_hat"].notna().any() else 0))  # fmt: skip
+    known = table["r_hat"].dropna()
+    left.set_xlim(min([0.999, *(known - 0.001)]), max([_RHAT + 0.002, *(known * 1.001)]))
     for name, style in (("ess_bulk", blue), ("ess_tail", orange)):
         right.plot(table[name], y, marker=style["marker"], color=style["color"], **dots)
     limit = _ESS_PER_CHAIN * chains
@@ -330,7 +331,8 @@ def predictive_plot(
     axes.set_ylim(bottom=-0.04 * max(high.max(initial=1), observed.max(initial=1)))
     axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     handles = [
-        Line2D([], [], color=theme.series[0], linewidth=3.2, alpha=0.45, label=f"predicted, middle {coverage:.0%}"),
+        Line2D([], [], color=theme.series[0], linewidth=3.2, alpha=0.45,
+               label=f"predicted, middle {coverage:.0%}"),
         Line2D([], [], color=theme.series[0], linestyle="none", marker="_", markersize=7, markeredgewidth=1.8,
                label="predicted mean"),
         Line2D([], [], **within, label=f"seen, inside ({inside.sum()})"),
@@ -399,7 +401,8 @@ def _draw_bars(
 ) -> None:
     axes.hlines(y, *_interval(weights, coverage), color=color, linewidth=width / 3)
     axes.hlines(y, *_interval(weights, 0.5), color=color, linewidth=width)
-    axes.plot(weights.median(("chain", "draw")), y, linestyle="none", marker=marker, markersize=size, color=color)  # fmt: skip
+    median = weights.median(("chain", "draw"))
+    axes.plot(median, y, linestyle="none", marker=marker, markersize=size, color=color)
 
 
 def _chain_handles(theme: Theme, chains: int, *, lines: bool) -> list[Line2D]:
