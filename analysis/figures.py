@@ -52,8 +52,8 @@ def learning_curves(
     figure.get_layout_engine().set(wspace=0.05)  # type: ignore[union-attr, call-arg]
     left, right = figure.subplots(1, 2)
     for i, curve in enumerate(curves):
-        _draw_band(left, theme, i, curve.method, curve.sessions, curve.accuracy, coverage)
-        _draw_band(right, theme, i, curve.method, curve.sessions, curve.log_likelihood, coverage)
+        draw_band(left, theme, i, curve.method, curve.sessions, curve.accuracy, coverage)
+        draw_band(right, theme, i, curve.method, curve.sessions, curve.log_likelihood, coverage)
     if expert_log_likelihood is not None:
         right.axhline(
             expert_log_likelihood,
@@ -67,7 +67,7 @@ def learning_curves(
     left.set_ylim(0, 1.02)
     left.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     for axes in (left, right):
-        _scale(axes, "x", x_scale)
+        set_scale(axes, "x", x_scale)
     head(figure, theme, right.get_legend_handles_labels()[0], title=title)
     runs = _span({len(np.atleast_2d(curve.accuracy)) for curve in curves})
     foot(figure, theme, f"line: median; band: middle {coverage:.0%} of {runs} runs")
@@ -101,10 +101,10 @@ def learning_time(
             raise ValueError(
                 f"the seconds of {time.method} must be positive to be shown on a logarithmic scale"
             )
-        _draw_band(axes, theme, i, time.method, time.trajectories, time.seconds, coverage)
+        draw_band(axes, theme, i, time.method, time.trajectories, time.seconds, coverage)
     dress(axes, theme, x="trajectories seen", y="learning time (s)")
-    _scale(axes, "x", "log")
-    _scale(axes, "y", "log")
+    set_scale(axes, "x", "log")
+    set_scale(axes, "y", "log")
     head(figure, theme, axes.get_legend_handles_labels()[0], title=title, columns=2)
     runs = _span({len(np.atleast_2d(time.seconds)) for time in times})
     foot(figure, theme, f"line: median; band: middle {coverage:.0%} of {runs} runs")
@@ -224,7 +224,7 @@ def weights_plot(
 # -- parts --------------------------------------------------------------------------------------------
 
 
-def _draw_band(
+def draw_band(
     axes: Axes,
     theme: Theme,
     i: int,
@@ -233,6 +233,10 @@ def _draw_band(
     runs: Float[np.ndarray, "seeds T"],
     coverage: float,
 ) -> None:
+    """The ``i``-th method's median over runs as a line, and a band that holds ``coverage`` of them.
+
+    Raises ``ValueError`` for runs of another length than ``x``.
+    """
     x, runs = np.asarray(x), np.atleast_2d(runs)
     if x.ndim != 1 or runs.shape[1:] != x.shape:
         raise ValueError(f"{method}: runs of shape {runs.shape} do not fit {x.shape} points along the axis")
@@ -245,7 +249,8 @@ def _draw_band(
     )
 
 
-def _scale(axes: Axes, which: str, scale: str) -> None:
+def set_scale(axes: Axes, which: str, scale: str) -> None:
+    """Scale of the axis ``which``, ``x`` or ``y``: ``linear`` or ``log``, the latter with plain numbers."""
     axis = axes.xaxis if which == "x" else axes.yaxis
     (axes.set_xscale if which == "x" else axes.set_yscale)(scale)
     if scale == "log":

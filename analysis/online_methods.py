@@ -28,7 +28,7 @@ from ..models.demonstration import Demonstration
 from ..models.evidence import Sensor
 from ..models.mdp import TabularMDP
 from ..models.planning import deterministic_policy, hard_plan, reward_of
-from .figures import _draw_band, _scale
+from .figures import draw_band, set_scale
 from .metrics import optimal_actions, policy_accuracy, quantile_band
 from .report import Picture, Section, Table, write_report
 from .style import Theme, dress, foot, head, new_figure, save_themes
@@ -263,7 +263,7 @@ def draw(study: MethodsStudy, theme: Theme) -> Figure:
     for panel, (family, members) in zip(panels, families.items(), strict=True):
         for i in members:
             curve = study.curves[i]
-            _draw_band(panel, theme, i, curve.name, study.points, curve.accuracy, 0.5)
+            draw_band(panel, theme, i, curve.name, study.points, curve.accuracy, 0.5)
         handles += panel.get_legend_handles_labels()[0]
         if len(study.curves) - 1 not in members:
             level = np.median(reference.accuracy, axis=0)
@@ -271,7 +271,7 @@ def draw(study: MethodsStudy, theme: Theme) -> Figure:
                 study.points, level, color=theme.muted, linewidth=1.0, label=f"{reference.name}, median"
             )
         dress(panel, theme, title=family, x="state-action pairs seen")
-        _scale(panel, "x", "log")
+        set_scale(panel, "x", "log")
         panel.tick_params(axis="y", left=panel is panels[0])
     compared = [line for line in panels[0].get_lines() if line.get_label() == f"{reference.name}, median"]
     panels[0].set_ylabel("learned behaviour accuracy\n(share of states)", color=theme.ink)

@@ -182,9 +182,7 @@ def darko_i2rl(
         if not np.isfinite(report.demonstration_log_likelihood):
             require_possible(Sensor(), mdp, demonstration)
             raise DemonstrationError("a trajectory has probability zero under the current policy")
-        arrays = {field: np.asarray(value) for field, value in report._asdict().items()}
-        values: dict[str, Any] = {field: x if x.ndim else x.item() for field, x in arrays.items()}
-        return new, Report(**values)._replace(seconds=time.perf_counter() - began)
+        return new, report.in_plain_numbers(time.perf_counter() - began)
 
     configuration = {"learning_rate": learning_rate, "decay": decay, "radius": radius, "steps": steps}
     return Learner("DARKO", mdp, configuration, init, update, session)

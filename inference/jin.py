@@ -146,9 +146,7 @@ def _learner(name: str, mdp: TabularMDP, learning_rate: float) -> Learner:
         began = time.perf_counter()
         _require_available(mdp, demonstration)
         new, report = session(state, demonstration.bucketed())
-        arrays = {field: np.asarray(value) for field, value in report._asdict().items()}
-        values: dict[str, Any] = {field: x if x.ndim else x.item() for field, x in arrays.items()}
-        return new, Report(**values)._replace(seconds=time.perf_counter() - began)
+        return new, report.in_plain_numbers(time.perf_counter() - began)
 
     return Learner(name, mdp, {"learning_rate": learning_rate}, init, update, session)
 

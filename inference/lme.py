@@ -456,9 +456,7 @@ def _learner(
         if not np.isfinite(report.demonstration_log_likelihood):
             require_possible(method.sensor, mdp, demonstration)
             raise DemonstrationError("a trajectory has probability zero under the current policy")
-        arrays = {name: np.asarray(value) for name, value in report._asdict().items()}
-        values: dict[str, Any] = {name: x if x.ndim else x.item() for name, x in arrays.items()}
-        return new, Report(**values)._replace(seconds=time.perf_counter() - began)
+        return new, report.in_plain_numbers(time.perf_counter() - began)
 
     @jax.jit
     def likelihood(state: LMEState, weights: Float[Array, " K"]) -> Float[Array, ""]:

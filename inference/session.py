@@ -64,6 +64,12 @@ class Report(NamedTuple):
     seconds: float
     weights: Float[np.ndarray, " K"]
 
+    def in_plain_numbers(self, seconds: float) -> Report:
+        """The report of a compiled session with Python's numbers and NumPy's arrays, and the time it took."""
+        arrays = {name: np.asarray(value) for name, value in self._asdict().items()}
+        values: dict[str, Any] = {name: x if x.ndim else x.item() for name, x in arrays.items()}
+        return Report(**values | {"seconds": seconds})
+
 
 class Learner(NamedTuple):
     """An online learner: configuration, and two functions on an explicit state.
