@@ -75,14 +75,18 @@ class Bound(NamedTuple):
     def assuming(self, **decided: bool) -> Bound:
         """The bound with assumptions decided by name: what its user knows and no run can show.
 
-        Raises ``ValueError`` for a name that is not one of its assumptions.
+        Raises ``ValueError`` for a name that is not one of its assumptions, and for one that was found not
+        to hold.
         """
-        names = [a.name for a in self.assumptions]
-        for name in decided:
-            if name not in names:
+        known = {a.name: a for a in self.assumptions}
+        for name, holds in decided.items():
+            if name not in known:
                 raise ValueError(
-                    f"{self.source} has no assumption {name!r}; its assumptions are {', '.join(names)}"
+                    f"{self.source} has no assumption {name!r}; its assumptions are {', '.join(known)}"
                 )
+            found = known[name]
+            if holds and found.holds is False:
+                raise ValueError(f"it cannot be assumed that {found.statement}: {found.reason or 'it fails'}")
         return self._replace(
             assumptions=tuple(
                 a._replace(holds=decided[a.name], reason=a.reason or "as stated by the user")
@@ -157,15 +161,19 @@ def check(
     length : int
         Steps of a trajectory: whether what lies beyond them is negligible against ``epsilon``.
     learner, state
-        The run: whether the program is the theorem's, and was solved within its slack.
+        The run: whether the program is the theorem's, and was solved within its slack in the state's
+        session (a bound on regret needs it of every session).
 
     Raises
     ------
     ValueError
-        For weights or a policy of another shape than the MDP's, or a state without its learner.
+        For weights or a policy of another shape than the MDP's, a state without its learner, or a learner
+        of another MDP.
     """
     if learner is None and state is not None:
         raise ValueError("a state is checked against its learner: give both")
+    if learner is not None and mdp is not None and learner.mdp.fingerprint() != mdp.fingerprint():
+        raise ValueError(f"{learner.name} learns on another MDP than the one given")
     mdp = learner.mdp if mdp is None and learner is not None else mdp
     found: dict[str, tuple[bool, str]] = {}
     if mdp is not None:
@@ -192,7 +200,7 @@ def check(
     if learner is not None:
         found["program"] = _theorems_program(learner, bound)
         if state is not None:
-            found |= _of_run(learner, state, bound.epsilon)
+            found["solved"] = _solved(learner, state, bound)
     return bound._replace(
         assumptions=tuple(
             a._replace(holds=found[a.name][0], reason=found[a.name][1]) if a.name in found else a
@@ -230,11 +238,18 @@ def _theorems_program(learner: Learner, bound: Bound) -> tuple[bool, str]:
     return bool(np.isclose(slack, epsilon, rtol=1e-6)), f"its slack is {slack:.4g}, epsilon is {epsilon:.4g}"
 
 
-def _of_run(learner: Learner, state: Any, epsilon: float) -> dict[str, tuple[bool, str]]:
+def _solved(learner: Learner, state: Any, bound: Bound) -> tuple[bool, str]:
+    """Whether the weights are feasible, and optimal up to a thousandth of the bound."""
     if learner.configuration.get("statistic") != "features":
-        return {"solved": (False, "another program was solved")}
-    mdp = learner.mdp
-    policy = soft_plan(mdp, reward_of(mdp, state.weights)).policy
-    reached = feature_expectations(mdp, policy, state.statistic.start)
-    gap = (1 - float(mdp.discount)) * float(jnp.max(jnp.abs(reached - state.statistic.features)))
-    return {"solved": (gap <= epsilon * (1 + 1e-3), f"its constraints are met within {gap:.4g}")}
+        return False, "another program was solved"
+    mdp, weights = learner.mdp, state.weights
+    policy = soft_plan(mdp, reward_of(mdp, weights)).policy
+    miss = feature_expectations(mdp, policy, state.statistic.start) - state.statistic.features
+    unit = 1 - float(mdp.discount)
+    gap = unit * float(jnp.max(jnp.abs(miss)))
+    # Complementary slackness: zero at the program's solution, and what else it could gain elsewhere.
+    excess = float(weights @ miss + bound.epsilon / unit * jnp.sum(jnp.abs(weights)))
+    return (
+        gap <= bound.epsilon * (1 + 1e-3) and abs(excess) <= 1e-3 * bound.error,
+        f"its constraints are met within {gap:.4g}, its duality gap is {excess:.2g} nats",
+    )

@@ -15,7 +15,8 @@ the expert's weights *on the data it was fitted to*, surely, with no probability
 probability ``1 - delta`` is the statement about the expert's *expected* log-likelihood: it is at most
 ``2 beta |theta_E|_1 <= 2 K epsilon / (1 - gamma)`` better than the solution's (Dudik et al. 2007, Theorem 1,
 which the proofs cite). Coverage is therefore measured on the expected gap; the sure one is
-:func:`sure_gap`.
+:func:`sure_gap`. Expectations are over trajectories from ``p0``, or, where the program is given the starts
+that were seen (as the learners' is), over trajectories from those.
 """
 
 from __future__ import annotations

@@ -70,7 +70,9 @@ def methods_table(mdp: TabularMDP, demonstration: Demonstration | None = None) -
     rows = [_described(learner) for learner in learners]
     if demonstration is not None:
         reward = ("theta [K]", mdp.n_features)
-        rows.append(("batch LME", *reward, "all trajectories", 2 * int(demonstration.lengths.sum())))
+        rows.append(
+            ("batch LME, of one stream", *reward, "all trajectories", 2 * int(demonstration.lengths.sum()))
+        )
     columns = ["method", "reward", "reward numbers", "statistic", "statistic numbers"]
     return pandas.DataFrame(rows, columns=columns)
 

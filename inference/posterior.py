@@ -316,7 +316,10 @@ def sample_posterior(
         keys = jax.random.split(completion_key, chains * draws)
         drawn = complete(keys, flat, problem, jnp.asarray(rows))
         completed = Completions(*(x.reshape(*shape, -1) for x in drawn))
-    return _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
+    idata = _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
+    for attrs in (idata.attrs, idata.posterior.attrs):
+        attrs["key"] = np.asarray(jax.random.key_data(key)).tolist()
+    return idata
 
 
 def _inference_data(

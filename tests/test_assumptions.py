@@ -89,6 +89,28 @@ def test_a_run_of_the_theorems_program_is_recognised(random_mdp):
     assert _holds(check(bound, learner=learner, state=moved), "solved") is False
 
 
+def test_feasible_weights_that_are_not_the_programs_solution_do_not_count_as_solved(random_mdp):
+    mdp = random_mdp(1)
+    weights = jnp.linspace(0.2, 0.8, mdp.n_features)
+    demonstration = sample_demonstration(jax.random.key(0), TrajectoryLaw(mdp, weights, Sensor(), 120), 8)
+    learner = me_i2rl(mdp, statistic="features", slack=0.3, iterations=30)
+    state = run_sessions(learner, demonstration.sessions(8), key=jax.random.key(1)).state
+    bound = me_i2rl_confidence(8, 0.3, mdp.n_features, float(mdp.discount))
+    assert _holds(check(bound, learner=learner, state=state), "solved") is True
+    wide = state._replace(weights=weights)  # within the slack, but not of largest entropy
+    checked = check(bound, learner=learner, state=wide)
+    assert _holds(checked, "solved") is False
+    assert "duality gap" in next(a.reason for a in checked.assumptions if a.name == "solved")
+
+
+def test_what_was_found_false_cannot_be_assumed():
+    patrol = instance(3)
+    bound = me_i2rl_confidence(500, 0.1, patrol.mdp.n_features, float(patrol.mdp.discount))
+    checked = check(bound, mdp=patrol.mdp, weights=patrol.weights)
+    with pytest.raises(ValueError, match=r"cannot be assumed that the expert's weights lie in \[0, 1\]"):
+        checked.assuming(weights=True)
+
+
 def test_another_statistic_or_slack_is_not_the_theorems_program(random_mdp):
     mdp = random_mdp(1)
     bound = lme_i2rl_confidence(300, 900, 0.1, 0.05, mdp.n_features, 0.9)
@@ -121,6 +143,8 @@ def test_what_cannot_be_checked_together_is_refused(random_mdp):
     bound = me_i2rl_confidence(8, 0.1, mdp.n_features, 0.9)
     with pytest.raises(ValueError, match="against its learner"):
         check(bound, state=object())
+    with pytest.raises(ValueError, match="learns on another MDP"):
+        check(bound, mdp=random_mdp(2), learner=me_i2rl(mdp))
     with pytest.raises(ValueError, match="give the MDP"):
         check(bound, length=5)
     with pytest.raises(ValueError, match="features, but weights have shape"):
