@@ -318,7 +318,7 @@ def sample_posterior(
         completed = Completions(*(x.reshape(*shape, -1) for x in drawn))
     idata = _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
     for attrs in (idata.attrs, idata.posterior.attrs):
-        attrs["key"] = np.asarray(jax.random.key_data(key)).tolist()
+        attrs["key"] = str(np.asarray(jax.random.key_data(key)).tolist())
     return idata
 
 

@@ -26,11 +26,11 @@ def test_the_table_counts_what_learners_carry(random_mdp):
     assert carried["ME-I2RL, features"] == carried["LME-I2RL, features"] == 1 + 2 + 5
     assert carried["LME-I2RL, counts"] == carried["LME-I2RL, seen"] == 1 + 5 * 3
     assert carried["LME-I2RL with random weights, seen"] == carried["LME-I2RL, seen"]
-    assert carried["batch LME"] == 6
+    assert carried["batch LME, of one stream"] == 6
     assert reward["Jin et al."] == 5
     assert (reward.drop("Jin et al.") == 2).all()
     assert table.loc["DARKO", "statistic"] == "none"
-    assert "batch LME" not in set(online_methods.methods_table(mdp)["method"])
+    assert "batch LME, of one stream" not in set(online_methods.methods_table(mdp)["method"])
 
 
 def test_no_statistic_grows_with_sessions(random_mdp):
@@ -104,7 +104,7 @@ def test_run_methods_writes_a_report(tmp_path, monkeypatch):
     content = json.loads(result.output)
     assert content == json.loads((folder / "results.json").read_text())
     assert content["pairs"][-1] == 40
-    assert [row["method"] for row in content["table 8.1"]][-1] == "batch LME"
+    assert [row["method"] for row in content["table 8.1"]][-1] == "batch LME, of one stream"
 
 
 def test_an_instance_or_method_that_does_not_exist_is_refused():
