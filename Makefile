@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 PEERS := .venv-peers
 
-.PHONY: run test lint bench bench-peers clean
+.PHONY: run test lint notebooks bench bench-peers clean
 
 run: $(READY)
 	$(BIN)/i2rl run patrol
@@ -19,12 +19,20 @@ lint: $(READY)
 	@mkdir -p build/lint && ln -sfn "$(CURDIR)" build/lint/i2rl
 	MYPYPATH=build/lint $(BIN)/mypy --config-file pyproject.toml -p i2rl.models -p i2rl.inference -p i2rl.domains -p i2rl.analysis
 
+# Executes the notebooks in place, at full size.
+notebooks: $(READY)
+	$(BIN)/python -m i2rl.analysis.notebooks.execute
+
 bench: $(READY)
 	$(BIN)/python -m i2rl.analysis.benchmarks.sessions
 	$(BIN)/python -m i2rl.analysis.benchmarks.accuracy
 	$(BIN)/python -m i2rl.analysis.benchmarks.planning
 	$(BIN)/python -m i2rl.analysis.benchmarks.posterior
 	$(BIN)/python -m i2rl.analysis.benchmarks.calibration
+	$(BIN)/python -m i2rl.analysis.benchmarks.coverage
+	$(BIN)/python -m i2rl.analysis.benchmarks.regret
+	$(BIN)/python -m i2rl.analysis.benchmarks.stopping
+	$(BIN)/python -m i2rl.analysis.benchmarks.selection
 	$(BIN)/python -m i2rl.analysis.benchmarks.kills
 
 bench-peers: $(READY) $(PEERS)/.installed

@@ -33,6 +33,17 @@ _HOMES = {
     ),
     "concentration": ("confidence_sequence", "empirical_bernstein", "hoeffding", "predictable_bernstein"),
     "coverage": ("Coverage", "Setting", "coverage_table", "full_view_coverage", "ignorance_gap"),
+    "diagnostic_figures": (
+        "completed_path",
+        "completion_frequencies",
+        "convergence_plot",
+        "forest_plot",
+        "predictive_plot",
+        "rank_plot",
+        "trace_plot",
+        "weights_by_session",
+    ),
+    "diagnostics": ("InferenceDataError", "posterior_by_session", "require_posterior", "summary"),
     "figures": (
         "LearningCurve",
         "LearningTime",
@@ -42,6 +53,7 @@ _HOMES = {
         "success_rates",
         "weights_plot",
     ),
+    "history": ("fleet_history", "run_history"),
     "identifiability": (
         "Identifiability",
         "describe_identifiability",
@@ -68,6 +80,7 @@ _HOMES = {
         "quantile_band",
     ),
     "online_methods": ("methods_table", "turning_places"),
+    "predictive": ("predictive_check", "predictive_visits"),
     "regret": (
         "BoundCurve",
         "Gaps",

@@ -317,7 +317,7 @@ def sample_posterior(
         drawn = complete(keys, flat, problem, jnp.asarray(rows))
         completed = Completions(*(x.reshape(*shape, -1) for x in drawn))
     idata = _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
-    for attrs in (idata.attrs, idata.posterior.attrs):
+    for attrs in (idata.attrs, idata["posterior"].attrs):
         attrs["key"] = str(np.asarray(jax.random.key_data(key)).tolist())
     return idata
 
