@@ -207,7 +207,7 @@ def _greedy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]
 
 def intended_outcomes(state: State, action: int) -> tuple[tuple[State, float], ...]:
     """What an action is meant to lead to, with probabilities, before slips (the final action versions)."""
-    onion, prediction, hand, listed = state
+    _, prediction, hand, listed = state
     if action == INSPECT:
         if prediction != UNKNOWN:
             return ((State(INSPECTED, prediction, AT_EYES, listed), 1.0),)
