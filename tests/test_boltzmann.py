@@ -65,7 +65,7 @@ def test_gradient_against_finite_differences(mdp, eta):
 
 
 def test_gradient_is_finite_where_an_action_is_the_only_one(random_mdp):
-    mdp = random_mdp(5, masked=True, n_states=12, n_actions=3)
+    mdp = random_mdp(5, masked=True, n_states=12, n_actions=2)
     assert (np.asarray(mdp.available).sum(1) == 1).any()
     counts = np.asarray(mdp.available, float)[None]
     gradient = jax.grad(lambda w: boltzmann_log_likelihoods(mdp, w, counts)[0])(jnp.array([0.3, 0.4]))
