@@ -1,4 +1,4 @@
-"""What is learned from: patrols, their breach, and a mouse in a labyrinth."""
+"""What is learned from: patrols and their breach, onion sorting, and a mouse in a labyrinth."""
 
 from .breach_trials import BreachOutcome, breach_trials, greedy_policies, random_policies, soft_policies
 from .labyrinth import Bout, Labyrinth, labyrinth, read_bouts, simulate_bouts
@@ -12,24 +12,38 @@ from .patrol import (
     instance,
     simulate_patrol,
 )
+from .sorting import (
+    MixedDemonstration,
+    Sorting,
+    demonstrate_sorting,
+    pick_inspect_place,
+    sorting_with_claiming,
+    sorting_without_claiming,
+)
 
 __all__ = [
     "Bout",
     "BreachOutcome",
     "Interaction",
     "Labyrinth",
+    "MixedDemonstration",
     "Patrol",
+    "Sorting",
     "boyd_fifth_floor",
     "boyd_with_rooms",
     "breach_trials",
     "demonstrate",
+    "demonstrate_sorting",
     "four_hallways",
     "greedy_policies",
     "instance",
     "labyrinth",
+    "pick_inspect_place",
     "random_policies",
     "read_bouts",
     "simulate_bouts",
     "simulate_patrol",
     "soft_policies",
+    "sorting_with_claiming",
+    "sorting_without_claiming",
 ]
