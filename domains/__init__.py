@@ -20,15 +20,18 @@ from .sorting import (
     sorting_with_claiming,
     sorting_without_claiming,
 )
+from .sorting_line import Line, Tally, sort_belts
 
 __all__ = [
     "Bout",
     "BreachOutcome",
     "Interaction",
     "Labyrinth",
+    "Line",
     "MixedDemonstration",
     "Patrol",
     "Sorting",
+    "Tally",
     "boyd_fifth_floor",
     "boyd_with_rooms",
     "breach_trials",
@@ -44,6 +47,7 @@ __all__ = [
     "simulate_bouts",
     "simulate_patrol",
     "soft_policies",
+    "sort_belts",
     "sorting_with_claiming",
     "sorting_without_claiming",
 ]
