@@ -35,7 +35,7 @@ def optimal_action_values(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float
 
 
 def boltzmann_log_policy(
-    mdp: TabularMDP, weights: Float[Array, " K"], eta: float = ETA
+    mdp: TabularMDP, weights: Float[Array, " K"], eta: float | Array = ETA
 ) -> Float[Array, "S A"]:
     """``log pi(a | s)``, the log-softmax of ``eta Q*`` over available actions; ``-inf`` where unavailable.
 
@@ -49,7 +49,7 @@ def boltzmann_log_likelihoods(
     mdp: TabularMDP,
     weights: Float[Array, " K"],
     counts: Float[Array, "n S A"],
-    eta: float = ETA,
+    eta: float | Array = ETA,
 ) -> Float[Array, " n"]:
     """``sum_{s, a} N_i(s, a) log pi(a | s)`` of each trajectory's visits ``N_i``, in nats.
 

@@ -215,7 +215,9 @@ def _langevin(
         return jax.tree.map(partial(jnp.where, accepted), there, point), accepted
 
     (value, _), gradient = objective(weights)
-    last, accepted = lax.scan(move, (weights, value, gradient, policy), jax.random.split(key, updates))
+    first = (weights, value, gradient, policy)
+    ends: tuple = lax.scan(move, first, jax.random.split(key, updates))
+    last, accepted = ends
     return last[0], last[3], jnp.sum(accepted)
 
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -67,7 +67,7 @@ def ascend(
     mdp: TabularMDP,
     counts: Float[Array, "S A"],
     start: Float[Array, " K"],
-    eta: float,
+    eta: float | Array,
     iterations: int,
     tolerance: float = 1e-7,
 ) -> Ascent:
@@ -208,7 +208,7 @@ class EMMLIRL(NamedTuple):
 
 
 def component_log_likelihoods(
-    mdp: TabularMDP, weights: Float[Array, "D K"], counts: Float[Array, "n S A"], eta: float
+    mdp: TabularMDP, weights: Float[Array, "D K"], counts: Float[Array, "n S A"], eta: float | Array
 ) -> Float[Array, "n D"]:
     """Log-likelihood of every trajectory under every cluster's weights; traceable."""
 
@@ -218,7 +218,7 @@ def component_log_likelihoods(
     return lax.map(one, weights).T
 
 
-def _e_step(mdp: TabularMDP, mixture: Mixture, counts: Float[Array, "n S A"], eta: Any) -> tuple:
+def _e_step(mdp: TabularMDP, mixture: Mixture, counts: Float[Array, "n S A"], eta: Array) -> tuple:
     """Responsibilities ``[n, D]`` and the marginal log-likelihood."""
     joint = jnp.log(mixture.proportions) + component_log_likelihoods(mdp, mixture.weights, counts, eta)
     marginal = jax.nn.logsumexp(joint, axis=1)
@@ -246,7 +246,8 @@ def _em(
         keys = jax.random.split(key, clusters)
         start = jax.vmap(random_weights, in_axes=(0, None))(keys, mdp.n_features)
         first = Mixture(start, jnp.full(clusters, 1 / clusters))
-        mixture, history = lax.scan(improve, first, None, iterations)
+        ends: tuple = lax.scan(improve, first, None, iterations)
+        mixture, history = ends
         responsibilities, log_likelihood = _e_step(mdp, mixture, counts, eta)
         return mixture, responsibilities, jnp.append(history, log_likelihood)
 
