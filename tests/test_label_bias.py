@@ -1,0 +1,187 @@
+import json
+from dataclasses import replace
+from functools import cache
+from itertools import product
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+from typer.testing import CliRunner
+
+from i2rl.analysis import label_bias
+from i2rl.analysis.cli import app
+from i2rl.analysis.label_bias import BOLTZMANN, MAXENT, OPTIMAL, Setting
+from i2rl.domains.object_world import object_world, walled_world, without_blocked_moves
+
+
+def _small_world():
+    walls = np.array([[0, 0, 1], [1, 0, 0]], bool)
+    return walled_world(walls, ((0, 0), (1, 2)), weights=(1.0, 0.5, -0.1), discount=0.8)
+
+
+@pytest.mark.parametrize("expert", [BOLTZMANN, OPTIMAL, MAXENT])
+@pytest.mark.parametrize("blocked", [True, False])
+def test_likelihoods_are_those_of_enumeration(expert, blocked):
+    world = _small_world() if blocked else without_blocked_moves(_small_world())
+    mdp, steps, eta = world.mdp, 3, 2.0
+    drawn = label_bias.demonstrate_and_score(
+        jax.random.key(0), mdp, jnp.asarray(world.weights), eta, expert=expert, steps=steps, n=20
+    )
+    reward = np.asarray(mdp.features) @ world.weights
+    available, following = np.asarray(mdp.available), np.asarray(mdp.successors)[..., 0]
+    value = np.zeros(mdp.n_states)
+    for _ in range(300):
+        q = np.where(available, reward + 0.8 * value[following], -np.inf)
+        value = q.max(1)
+    boltzmann = np.exp(eta * q) / np.exp(eta * q).sum(1, keepdims=True)
+    earned, likely = {}, {}
+    for first, *actions in product(range(mdp.n_states), *[range(mdp.n_actions)] * steps):
+        state, total, chance, open_way = first, 0.0, 1.0, True
+        for action in actions:
+            open_way &= bool(available[state, action])
+            total += reward[state, action]
+            chance *= boltzmann[state, action]
+            state = following[state, action]
+        if open_way:
+            earned[first, *actions], likely[first, *actions] = total, chance
+    log_z = np.log(np.exp(list(earned.values())).sum())
+    for i in range(20):
+        one = (int(drawn.states[i, 0]), *map(int, drawn.actions[i]))
+        assert drawn.reward[i] == pytest.approx(earned[one], abs=1e-12)
+        assert drawn.maxent[i] == pytest.approx(earned[one] - log_z, abs=1e-12)
+        assert drawn.birl[i] == pytest.approx(np.log(likely[one]), abs=1e-9)
+        path = np.asarray(drawn.states[i]), np.asarray(drawn.actions[i])
+        advantages = (q - q.max(1, keepdims=True))[path].sum()
+        assert drawn.birl[i] == pytest.approx(eta * advantages - float(drawn.choice[i]), abs=1e-9)
+
+
+def test_experts_draw_from_their_laws():
+    world = _small_world()
+    drawn = {
+        expert: label_bias.demonstrate_and_score(
+            jax.random.key(1), world.mdp, jnp.asarray(world.weights), 2.0, expert=expert, steps=2, n=20_000
+        )
+        for expert in (BOLTZMANN, MAXENT)
+    }
+    starts = len(world.cells)
+    for expert, log_law in (
+        (BOLTZMANN, np.asarray(drawn[BOLTZMANN].birl) - np.log(starts)),
+        (MAXENT, np.asarray(drawn[MAXENT].maxent)),
+    ):
+        paths = np.column_stack([drawn[expert].states[:, 0], drawn[expert].actions])
+        _, where, counts = np.unique(paths, axis=0, return_index=True, return_counts=True)
+        chance = np.exp(log_law[where])
+        often = chance > 5 / 20_000
+        score = (counts - 20_000 * chance)[often] / np.sqrt(20_000 * chance * (1 - chance))[often]
+        assert stats.chi2.sf((score**2).sum(), often.sum()) > 1e-4
+
+
+def test_optimal_experts_earn_the_most_there_is():
+    world = object_world(jax.random.key(2), 6, 8)
+    drawn = label_bias.demonstrate_and_score(
+        jax.random.key(3), world.mdp, jnp.asarray(world.weights), 1.0, expert=OPTIMAL, steps=8, n=50
+    )
+    best = np.zeros(len(world.cells))
+    reward, following = (
+        np.asarray(world.mdp.features) @ world.weights,
+        np.asarray(world.mdp.successors)[..., 0],
+    )
+    for _ in range(8):
+        best = (reward + best[following]).max(1)
+    np.testing.assert_allclose(drawn.reward, best[np.asarray(drawn.states[:, 0])])
+
+
+def test_correlation_is_pearsons():
+    x, y = np.random.default_rng(0).normal(size=(2, 40))
+    found = label_bias.correlation(x, y)
+    assert found.rho == pytest.approx(np.corrcoef(x, y)[0, 1])
+    assert found.p == pytest.approx(label_bias.significance(found.rho, 40))
+    centre, width = np.arctanh(found.rho), stats.norm.ppf(0.975) / np.sqrt(37)
+    assert (found.low, found.high) == pytest.approx((np.tanh(centre - width), np.tanh(centre + width)))
+    with pytest.raises(ValueError, match="constant"):
+        label_bias.correlation(x, np.full(40, 0.1) * 3)
+
+
+@cache
+def _study():
+    settings = (Setting(), Setting(OPTIMAL, eta=10.0), Setting(MAXENT, blocked=False))
+    return label_bias.study(8, seed=3, settings=settings, etas=(1.0, 10.0))
+
+
+def test_maximum_entropy_has_no_label_bias():
+    for result in _study().results:
+        known = np.isfinite(result.maxent)
+        assert known.any()
+        np.testing.assert_allclose(result.maxent[known], 1.0, atol=1e-8)
+    assert _study().maxent.rho == pytest.approx(1.0, abs=1e-8)
+    assert _study().maxent.p < 1e-12
+
+
+def test_bayesian_irl_has():
+    first, optimal, _ = _study().results
+    assert _study().birl.p > 0.05
+    assert first.significant < 0.5
+    # What the choices met on the way cost outweighs what better actions bring.
+    assert (optimal.birl < -0.5).all()
+    assert (optimal.choice > 0.5).all()
+
+
+def test_the_world_shown_is_the_median_one():
+    study = _study()
+    assert study.birl.rho == pytest.approx(np.sort(study.results[0].birl)[3])
+    assert study.trajectories.states.shape == (75, Setting().steps)
+    along = study.trajectories.states[:, :-1], study.trajectories.actions[:, :-1]
+    assert (study.world.mdp.successors[along][..., 0] == study.trajectories.states[:, 1:]).all()
+
+
+def test_the_same_seed_gives_the_same_numbers():
+    few = {"settings": (Setting(),), "etas": (1.0,)}
+    one, again, other = (label_bias.study(2, 10, seed=s, **few) for s in (0, 0, 1))
+    assert (one.results[0].birl == again.results[0].birl).all()
+    assert (one.results[0].birl != other.results[0].birl).any()
+
+
+@pytest.mark.parametrize("given", [(0, 75), (3, 2)])
+def test_too_little_is_refused(given):
+    with pytest.raises(ValueError, match="at least 1 world, 3 trajectories"):
+        label_bias.study(*given)
+
+
+def test_an_unknown_expert_is_refused():
+    with pytest.raises(ValueError, match="expert must be"):
+        label_bias.study(1, 3, settings=(Setting("lucky"),), etas=())
+
+
+def test_worlds_without_a_correlation_are_left_out():
+    # From every cell of a world of objects alone the optimal experts earn the same.
+    study = _study()
+    flat = replace(study.world.mdp, features=jnp.zeros_like(study.world.mdp.features))
+    stacked = jax.tree.map(lambda x: x[None], flat)
+    walked = label_bias._in_every_world(
+        jax.random.split(jax.random.key(0), 1), stacked, jnp.asarray(study.world.weights), 1.0, 0.99,
+        label_bias.EXPERTS.index(BOLTZMANN), steps=10, n=10,
+    )  # fmt: skip
+    assert np.isnan(label_bias._result(Setting(), walked).birl).all()
+
+
+def test_the_report_is_complete(tmp_path):
+    page = label_bias.write(_study(), tmp_path).read_text()
+    assert "Label bias" in page
+    for name in ("world", "scatter", "settings", "sweep"):
+        for theme in ("light", "dark"):
+            assert (tmp_path / f"{name}-{theme}.png").stat().st_size > 5000
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert results["dissertation"]["p of that rho for 75 trajectories"] == pytest.approx(0.1285, abs=1e-4)
+    assert len(results["settings"]) == 3
+
+
+def test_the_command_runs(tmp_path):
+    result = CliRunner().invoke(
+        app,
+        ["run", "label-bias", "--worlds", "2", "--trajectories", "10", "--report", str(tmp_path), "--json"],
+    )
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.stdout)["trajectories"] == 10
+    assert (tmp_path / "index.html").exists()
