@@ -7,7 +7,14 @@ import importlib
 from typing import Any
 
 _HOMES = {
+    "boltzmann": (
+        "boltzmann_log_likelihoods",
+        "boltzmann_log_policy",
+        "optimal_action_values",
+        "visit_counts",
+    ),
     "darko": ("darko_i2rl", "ending_at", "feature_margin", "goal_sessions", "stopping_places", "with_end"),
+    "dpm": ("DPMBIRL", "DPMTrace", "dpm_birl"),
     "jin": ("jin_i2rl", "jin_i2rl_with_features", "reward_correction", "with_state_features"),
     "journal": ("Journal", "JournalBusy", "JournalError", "JournalView", "Position", "SessionRecord"),
     "lme": (
@@ -23,6 +30,7 @@ _HOMES = {
     "maxent_constraints": ("FeatureTarget", "InfeasibleProgram", "ProgramNotSolved"),
     "maxent_dual": ("CountProgram", "DualProgram"),
     "maxent_primal": ("PrimalProgram",),
+    "maximum_likelihood": ("EMMLIRL", "EMTrace", "MLIRLFit", "em_mlirl", "mlirl"),
     "mce": (
         "CausalEntropyFit",
         "UnmatchedError",
@@ -32,6 +40,7 @@ _HOMES = {
         "fit_state_rewards",
         "fit_weights",
     ),
+    "policy_walk": ("birl",),
     "posterior": ("sample_posterior",),
     "schedule": ("Harmonic",),
     "session": (

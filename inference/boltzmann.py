@@ -20,6 +20,8 @@ from ..models.planning import action_values, hard_plan, policy_values, reward_of
 
 # Inverse temperature of the published baselines.
 ETA = 10.0
+# Weights lie in [-BOX, BOX]: the likelihood of a greedy expert has no maximum without a bound.
+BOX = 1.0
 
 
 def optimal_action_values(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
@@ -124,3 +126,24 @@ def visit_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.ndar
     counts = np.zeros((len(kind), mdp.n_states, mdp.n_actions))
     np.add.at(counts, (i, s, a), 1.0)
     return counts
+
+
+# -- what the baselines share ---------------------------------------------------------------------------
+
+
+def random_weights(key: Array, n_features: int) -> Float[Array, " K"]:
+    """Uniform on the box."""
+    return jax.random.uniform(key, (n_features,), float, -BOX, BOX)
+
+
+def reflected(x: Float[Array, " K"]) -> Float[Array, " K"]:
+    """Fold the line into the box, as between two mirrors."""
+    along = jnp.mod(x + BOX, 4 * BOX)
+    return jnp.where(along > 2 * BOX, 4 * BOX - along, along) - BOX
+
+
+def require_positive(**numbers: float) -> None:
+    """Raise ``ValueError`` naming the first number that is not positive and finite."""
+    for name, number in numbers.items():
+        if not (number > 0 and np.isfinite(number)):
+            raise ValueError(f"{name} must be positive, got {number}")

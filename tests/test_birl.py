@@ -5,8 +5,8 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 
-from i2rl.inference.birl import birl
 from i2rl.inference.boltzmann import boltzmann_log_likelihoods, boltzmann_log_policy, visit_counts
+from i2rl.inference.policy_walk import birl
 from i2rl.models import Demonstration, DemonstrationError
 from i2rl.models.planning import simulate
 

@@ -11,7 +11,6 @@ from i2rl.inference.boltzmann import (
 )
 from i2rl.models import Demonstration, DemonstrationError, TabularMDP
 
-
 log_policy_of = jax.jit(boltzmann_log_policy)
 
 

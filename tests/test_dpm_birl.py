@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from i2rl.inference.boltzmann import boltzmann_log_likelihoods, boltzmann_log_policy, visit_counts
-from i2rl.inference.dpm_birl import best_sample, crp_log_probability, dpm_birl
+from i2rl.inference.dpm import best_sample, crp_log_probability, dpm_birl
 from i2rl.models import Demonstration, DemonstrationError
 from i2rl.models.demonstration import concatenate
 from i2rl.models.planning import simulate
@@ -39,7 +39,7 @@ def jumble(demonstrate):
 def long_run(mdp, jumble):
     """Many sweeps of the sampler with moves wide enough to bounce off the box's walls."""
     return dpm_birl(
-        mdp, eta=ETA, alpha=ALPHA, sweeps=12_000, proposals=1, updates=1, sigma=0.4
+        mdp, eta=ETA, alpha=ALPHA, sweeps=8_000, proposals=1, updates=1, sigma=0.4
     ).sample(jax.random.key(0), jumble)  # fmt: skip
 
 
@@ -100,7 +100,7 @@ def test_partition_probabilities_sum_to_one_and_follow_the_restaurant():
 
 
 def test_without_data_the_partition_follows_its_prior(mdp, jumble):
-    blind = dpm_birl(mdp, eta=1e-12, alpha=ALPHA, sweeps=12_000, proposals=1, updates=1, sigma=0.4)
+    blind = dpm_birl(mdp, eta=1e-12, alpha=ALPHA, sweeps=8_000, proposals=1, updates=1, sigma=0.4)
     trace = blind.sample(jax.random.key(1), jumble)
     prior = np.exp([log_seating(p, ALPHA) for p in partitions(4)])
     np.testing.assert_allclose(frequencies(trace, 4), prior, atol=0.02)

@@ -24,9 +24,16 @@ from jaxtyping import Array, Float, Int
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted
-from .boltzmann import ETA, boltzmann_log_policy, visit_counts
+from .boltzmann import (
+    BOX,
+    ETA,
+    boltzmann_log_policy,
+    random_weights,
+    reflected,
+    require_positive,
+    visit_counts,
+)
 from .clustering import Clustering
-from .mlirl import BOX, random_weights, require_positive
 
 # Reflections of a move beyond the nearest are left out of its density: exact to rounding up to this width.
 _WIDEST = 0.5
@@ -168,12 +175,6 @@ def _reseat(
 
 
 # -- weights ------------------------------------------------------------------------------------------
-
-
-def reflected(x: Float[Array, " K"]) -> Float[Array, " K"]:
-    """Fold the line into the box, as between two mirrors."""
-    along = jnp.mod(x + BOX, 4 * BOX)
-    return jnp.where(along > 2 * BOX, 4 * BOX - along, along) - BOX
 
 
 def _log_move(to: Float[Array, " K"], mean: Float[Array, " K"], sigma: Array) -> Float[Array, ""]:

@@ -22,9 +22,16 @@ from ..models.mdp import TabularMDP
 from ..models.occlusion import weights_prior
 from ..models.planning import require_discounted
 from ..version import __version__
-from .boltzmann import ETA, boltzmann_log_policy, count_log_likelihoods, visit_counts
-from .dpm_birl import reflected
-from .mlirl import BOX, random_weights, require_positive
+from .boltzmann import (
+    BOX,
+    ETA,
+    boltzmann_log_policy,
+    count_log_likelihoods,
+    random_weights,
+    reflected,
+    require_positive,
+    visit_counts,
+)
 from .posterior import _described
 
 # Acceptance the step is tuned to: best for a random walk in several dimensions (Roberts et al. 1997).

@@ -20,11 +20,16 @@ from jaxtyping import Array, Float, Int
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted
-from .boltzmann import ETA, boltzmann_log_policy, count_log_likelihoods, visit_counts
+from .boltzmann import (
+    BOX,
+    ETA,
+    boltzmann_log_policy,
+    count_log_likelihoods,
+    random_weights,
+    require_positive,
+    visit_counts,
+)
 from .clustering import Clustering
-
-# Weights lie in [-BOX, BOX]: likelihoods of greedy experts have no maximum without a bound.
-BOX = 1.0
 
 
 class MLIRLFit(NamedTuple):
@@ -56,11 +61,6 @@ class Ascent(NamedTuple):
     gradient: Float[Array, " K"]
     step: Float[Array, ""]
     iterations: Int[Array, ""]
-
-
-def random_weights(key: Array, n_features: int) -> Float[Array, " K"]:
-    """Uniform on the box."""
-    return jax.random.uniform(key, (n_features,), float, -BOX, BOX)
 
 
 def ascend(
@@ -153,13 +153,6 @@ def mlirl(
         np.asarray(ends.value),
         np.asarray(ends.iterations),
     )
-
-
-def require_positive(**numbers: float) -> None:
-    """Raise ``ValueError`` naming the first number that is not positive and finite."""
-    for name, number in numbers.items():
-        if not (number > 0 and np.isfinite(number)):
-            raise ValueError(f"{name} must be positive, got {number}")
 
 
 def require_clusters(clusters: int, trajectories: int) -> None:
