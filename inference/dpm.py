@@ -177,7 +177,7 @@ def _reseat(
 # -- weights ------------------------------------------------------------------------------------------
 
 
-def _log_move(to: Float[Array, " K"], mean: Float[Array, " K"], sigma: Array) -> Float[Array, ""]:
+def log_move(to: Float[Array, " K"], mean: Float[Array, " K"], sigma: Array) -> Float[Array, ""]:
     """Log-density of a reflected Gaussian move, a constant left out."""
     images = jnp.stack([to, 2 * BOX - to, -2 * BOX - to, to + 4 * BOX, to - 4 * BOX])
     return jnp.sum(jax.nn.logsumexp(-0.5 * ((images - mean) / sigma) ** 2, axis=0))
@@ -209,8 +209,8 @@ def _langevin(
         mean = drifted(w, gradient)
         proposal = reflected(mean + sigma * jax.random.normal(noise_key, w.shape))
         (value_there, policy_there), gradient_there = objective(proposal)
-        back = _log_move(w, drifted(proposal, gradient_there), sigma)
-        ratio = value_there - value + back - _log_move(proposal, mean, sigma)
+        back = log_move(w, drifted(proposal, gradient_there), sigma)
+        ratio = value_there - value + back - log_move(proposal, mean, sigma)
         accepted = jnp.log(jax.random.uniform(accept_key)) < ratio
         there = (proposal, value_there, gradient_there, policy_there)
         return jax.tree.map(partial(jnp.where, accepted), there, point), accepted

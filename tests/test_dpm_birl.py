@@ -6,8 +6,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from i2rl.inference.boltzmann import boltzmann_log_likelihoods, boltzmann_log_policy, visit_counts
-from i2rl.inference.dpm import best_sample, crp_log_probability, dpm_birl
+from i2rl.inference.boltzmann import (
+    boltzmann_log_likelihoods,
+    boltzmann_log_policy,
+    reflected,
+    visit_counts,
+)
+from i2rl.inference.dpm import best_sample, crp_log_probability, dpm_birl, log_move
 from i2rl.models import Demonstration, DemonstrationError
 from i2rl.models.demonstration import concatenate
 from i2rl.models.planning import simulate
@@ -97,6 +102,19 @@ def test_partition_probabilities_sum_to_one_and_follow_the_restaurant():
     np.testing.assert_allclose(np.exp(logs).sum(), 1)
     sizes = [np.bincount(p, minlength=7) for p in partitions(5)]
     np.testing.assert_allclose([crp_log_probability(jnp.asarray(x), ALPHA) for x in sizes], logs)
+
+
+@pytest.mark.parametrize("mean", [-1.0, 0.9, 0.2])
+def test_density_of_a_reflected_move(mean):
+    axis = np.linspace(-1, 1, 401)
+    log_density = jax.vmap(lambda x: log_move(x[None], jnp.array([mean]), 0.5))(axis)
+    density = np.exp(log_density) / (0.5 * np.sqrt(2 * np.pi))
+    np.testing.assert_allclose(np.trapezoid(density, axis), 1, atol=1e-4)
+    moves = reflected(mean + 0.5 * np.random.default_rng(0).normal(size=200_000))
+    assert (np.abs(moves) <= 1).all()
+    lower = axis <= 0.5
+    below = np.trapezoid(density[lower], axis[lower])
+    np.testing.assert_allclose((moves <= 0.5).mean(), below, atol=0.005)
 
 
 def test_without_data_the_partition_follows_its_prior(mdp, jumble):
