@@ -177,7 +177,8 @@ def demonstrate_sorting(
 ) -> MixedDemonstration:
     """Simulate sorters who act optimally: ``counts[b]`` trajectories of behaviour ``b``, in that order.
 
-    Raises ``ValueError`` unless there is a count for every behaviour and at least one trajectory and step.
+    Fewer counts than behaviours leave the last ones out. Raises ``ValueError`` for more counts than
+    behaviours, a negative one, or no trajectory or step at all.
     """
     if len(counts) > len(sorting.behaviours) or min(counts, default=0) < 0 or not sum(counts):
         raise ValueError(

@@ -235,6 +235,13 @@ def test_policies_without_claiming(behaviour, empty):
     assert policy == FORCED | {"0222": "P", "0202": "P"} | dict.fromkeys(STARTS, empty)
 
 
+@pytest.mark.parametrize("process", PROCESSES)
+def test_no_expert_is_torn_between_actions(process):
+    sorting = PROCESSES[process][0]()
+    for behaviour, weights in enumerate(sorting.weights):
+        assert choices(sorting.mdp, codes(sorting), weights) == policy_of(sorting, behaviour)
+
+
 def test_claiming_cannot_be_expressed_on_23_states():
     sorting = sorting_without_claiming()
     assert policy_of(sorting, STAY) == policy_of(sorting, PIP)
