@@ -1,0 +1,276 @@
+"""Every domain as a Gymnasium environment: importing this module registers them all.
+
+======================================  ================================================================
+``i2rl/Patrol1-v0`` to ``Patrol3-v0``   one patroller on its floor
+``i2rl/Labyrinth-v0``                   a mouse that is rewarded for water
+``i2rl/SortingWithClaiming-v0``         onion sorting, 26 states; ``behaviour`` says whose reward
+``i2rl/SortingWithoutClaiming-v0``      onion sorting, 23 states; likewise
+``i2rl/PickInspectPlace-v0``            onion sorting, 22 states
+``i2rl/ObjectWorld-v0``                 a walled grid; ``layout`` seeds its walls
+======================================  ================================================================
+
+All take ``weights``, the reward ``weights . phi(s, a)`` (by default the domain's true ones). Episodes never
+terminate; they are truncated after the steps given at registration (``max_episode_steps``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import jax
+import numpy as np
+from gymnasium.spaces import Discrete
+from jaxtyping import UInt8
+
+from ..models.mdp import TabularMDP
+from .labyrinth import WATER_PORT, labyrinth
+from .object_world import object_world
+from .patrol import instance
+from .sorting import Sorting, pick_inspect_place, sorting_with_claiming, sorting_without_claiming
+
+if TYPE_CHECKING:
+    from .pictures import Scene
+
+
+class TabularEnv(gymnasium.Env[int, int]):
+    """A finite decision process and a reward as a Gymnasium environment.
+
+    Observations are states, actions the process's actions. ``info["action_mask"]`` (int8, ``[A]``) says at
+    every reset and step which actions the state offers; ``env.action_space.sample(info["action_mask"])``
+    draws among them. An action that is not offered changes nothing and earns nothing, and
+    ``info["available"]`` is then False; with ``strict`` it is a ``ValueError`` that names state and action.
+    The reward of a step is ``weights . phi(s, a)``, an expectation where features depend on what happens.
+
+    Episodes never terminate. ``reset(options={"state": ...})`` begins in a state given by number or name,
+    otherwise the first state is drawn from the process's initial distribution.
+
+    Parameters
+    ----------
+    mdp : TabularMDP
+    weights : ``[K]`` numbers
+    render_mode : "rgb_array", "ansi" or None
+    strict : bool
+    scene : function of no arguments or None
+        Makes the picture for ``rgb_array`` when it is first asked for; None draws the state's name.
+
+    Raises
+    ------
+    ValueError
+        For weights that are not one finite number a feature, and for another ``render_mode``.
+    """
+
+    metadata = {"render_modes": ["rgb_array", "ansi"], "render_fps": 4}  # noqa: RUF012 (Gymnasium's name)
+
+    def __init__(
+        self,
+        mdp: TabularMDP,
+        weights: Sequence[float] | np.ndarray,
+        *,
+        render_mode: str | None = None,
+        strict: bool = False,
+        scene: Callable[[], Scene] | None = None,
+    ):
+        theta = np.asarray(weights, float)
+        if theta.shape != (mdp.n_features,) or not np.isfinite(theta).all():
+            raise ValueError(
+                f"weights must be {mdp.n_features} finite numbers, one a feature "
+                f"({', '.join(mdp.feature_names[:12])}{', ...' * (mdp.n_features > 12)}), got {weights}"
+            )
+        if render_mode is not None and render_mode not in self.metadata["render_modes"]:
+            raise ValueError(
+                f"render_mode must be one of {', '.join(self.metadata['render_modes'])} or None, "
+                f"got {render_mode!r}"
+            )
+        self.mdp, self.weights, self.strict, self.render_mode = mdp, theta, strict, render_mode
+        self.observation_space = Discrete(mdp.n_states)
+        self.action_space = Discrete(mdp.n_actions)
+        # NumPy's copies: single look-ups cost JAX a hundred times more.
+        self._successors = np.asarray(mdp.successors)
+        self._cumulative = np.cumsum(np.asarray(mdp.probabilities), axis=-1)
+        self._initial = np.cumsum(np.asarray(mdp.initial))
+        self._reward = np.asarray(mdp.features) @ theta
+        self._mask = np.asarray(mdp.available).astype(np.int8)
+        self._make_scene, self._scene = scene, None
+        self._state: int | None = None
+        self._last: tuple[int, float] | None = None
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[int, dict[str, Any]]:
+        """Begin an episode; ``options`` may give the ``state`` to begin in, by number or name.
+
+        Raises ``ValueError`` for another option or a state that does not exist.
+        """
+        super().reset(seed=seed)
+        given = dict(options or {})
+        state = given.pop("state", None)
+        if given:
+            raise ValueError(f"reset knows the option 'state' only, got {', '.join(map(repr, given))}")
+        if state is None:
+            self._state = _drawn(self._initial, self.np_random.random())
+        else:
+            self._state = self._state_given(state)
+        self._last = None
+        return self._state, {"action_mask": self._mask[self._state].copy()}
+
+    def _state_given(self, state: int | str) -> int:
+        if isinstance(state, str):
+            if state not in self.mdp.state_names:
+                raise ValueError(f"there is no state named {state!r}; one is {self.mdp.state_names[0]!r}")
+            return self.mdp.state_names.index(state)
+        if not isinstance(state, int | np.integer) or not 0 <= state < self.mdp.n_states:
+            raise ValueError(f"states are 0 to {self.mdp.n_states - 1} or a name, got {state!r}")
+        return int(state)
+
+    def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
+        """Do an action: the state reached, its reward, False, False, and ``action_mask`` and ``available``.
+
+        Raises ``ValueError`` for an action that does not exist, and if ``strict`` for one that the state does
+        not offer; ``gymnasium.error.ResetNeeded`` before the first reset.
+        """
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("reset the environment before the first step")
+        if not self.action_space.contains(action):
+            raise ValueError(f"actions are 0 to {self.mdp.n_actions - 1}, got {action!r}")
+        state, action = self._state, int(action)
+        offered = bool(self._mask[state, action])
+        if not offered and self.strict:
+            names = [self.mdp.action_names[a] for a in np.flatnonzero(self._mask[state])]
+            raise ValueError(
+                f"state {self.mdp.state_names[state]!r} ({state}) does not offer "
+                f"{self.mdp.action_names[action]!r} ({action}); it offers {', '.join(names)}"
+            )
+        if offered:
+            branch = _drawn(self._cumulative[state, action], self.np_random.random())
+            self._state = int(self._successors[state, action, branch])
+        reward = float(self._reward[state, action]) if offered else 0.0
+        self._last = action, reward
+        info = {"action_mask": self._mask[self._state].copy(), "available": offered}
+        return self._state, reward, False, False, info
+
+    def render(self) -> UInt8[np.ndarray, "height width 3"] | str | None:  # type: ignore[override]
+        """A picture (``rgb_array``), the caption alone (``ansi``), or None without a render mode."""
+        if self.render_mode is None:
+            gymnasium.logger.warn("render was called without a render_mode; make the environment with one")
+            return None
+        if self._state is None:
+            raise gymnasium.error.ResetNeeded("reset the environment before rendering it")
+        from .pictures import Frame, caption, text_scene
+
+        shown = Frame(self._state, *(self._last or ()))
+        if self.render_mode == "ansi":
+            return caption(self.mdp, shown)
+        if self._scene is None:
+            self._scene = self._make_scene() if self._make_scene else text_scene(self.mdp)
+        return self._scene.frame(shown)
+
+
+def _drawn(cumulative: np.ndarray, uniform: float) -> int:
+    """Index of a draw by its cumulative probabilities; never one of probability zero."""
+    return int(np.searchsorted(cumulative, uniform * cumulative[-1], side="right"))
+
+
+# -- the domains ----------------------------------------------------------------------------------------
+
+
+def patrol_environment(number: int = 2, weights: Sequence[float] | None = None, **options: Any) -> TabularEnv:
+    """One patroller of an instance; other options as :class:`TabularEnv`."""
+    patrol = instance(number)
+
+    def scene() -> Scene:
+        from .pictures import patrol_scene
+
+        return patrol_scene(patrol)
+
+    return TabularEnv(patrol.mdp, patrol.weights if weights is None else weights, scene=scene, **options)
+
+
+def labyrinth_environment(weights: Sequence[float] | None = None, **options: Any) -> TabularEnv:
+    """The mouse; by default reaching the water port earns one, and nothing else anything."""
+    maze = labyrinth()
+    if weights is None:
+        weights = np.array([name == f"reaches {WATER_PORT}" for name in maze.mdp.feature_names], float)
+
+    def scene() -> Scene:
+        from .pictures import labyrinth_scene
+
+        return labyrinth_scene(maze)
+
+    return TabularEnv(maze.mdp, weights, scene=scene, **options)
+
+
+_SORTING = {
+    "with claiming": sorting_with_claiming,
+    "without claiming": sorting_without_claiming,
+    "pick-inspect-place": pick_inspect_place,
+}
+
+
+def sorting_environment(
+    process: str = "with claiming",
+    behaviour: str | None = None,
+    weights: Sequence[float] | None = None,
+    **options: Any,
+) -> TabularEnv:
+    """Onion sorting; the reward is that of ``behaviour`` (by default the first), or ``weights``.
+
+    Raises ``ValueError`` for a process or behaviour that does not exist, and if both ``behaviour`` and
+    ``weights`` are given.
+    """
+    if process not in _SORTING:
+        raise ValueError(f"process must be one of {', '.join(_SORTING)}, got {process!r}")
+    sorting = _SORTING[process]()
+    if weights is not None and behaviour is not None:
+        raise ValueError("a reward is given by behaviour or by weights, not both")
+    reward = _weights_of(sorting, behaviour) if weights is None else weights
+
+    def scene() -> Scene:
+        from .sorting_picture import sorting_scene
+
+        return sorting_scene(sorting)
+
+    return TabularEnv(sorting.mdp, reward, scene=scene, **options)
+
+
+def _weights_of(sorting: Sorting, behaviour: str | None) -> np.ndarray:
+    name = sorting.behaviours[0] if behaviour is None else behaviour
+    if name not in sorting.behaviours:
+        raise ValueError(f"behaviour must be one of {', '.join(sorting.behaviours)}, got {name!r}")
+    return sorting.weights[sorting.behaviours.index(name)]
+
+
+def object_world_environment(
+    layout: int = 0,
+    size: int = 10,
+    walls: int = 25,
+    slip: float = 0.0,
+    weights: Sequence[float] | None = None,
+    **options: Any,
+) -> TabularEnv:
+    """An Object World whose walls are drawn from the seed ``layout``."""
+    world = object_world(jax.random.key(layout), size, walls, slip=slip)
+
+    def scene() -> Scene:
+        from .pictures import object_world_scene
+
+        return object_world_scene(world)
+
+    return TabularEnv(world.mdp, world.weights if weights is None else weights, scene=scene, **options)
+
+
+_HERE = __name__
+ENVIRONMENTS: dict[str, tuple[str, int, dict[str, Any]]] = {
+    "i2rl/Patrol1-v0": ("patrol_environment", 200, {"number": 1}),
+    "i2rl/Patrol2-v0": ("patrol_environment", 200, {"number": 2}),
+    "i2rl/Patrol3-v0": ("patrol_environment", 200, {"number": 3}),
+    "i2rl/Labyrinth-v0": ("labyrinth_environment", 200, {}),
+    "i2rl/SortingWithClaiming-v0": ("sorting_environment", 50, {"process": "with claiming"}),
+    "i2rl/SortingWithoutClaiming-v0": ("sorting_environment", 50, {"process": "without claiming"}),
+    "i2rl/PickInspectPlace-v0": ("sorting_environment", 50, {"process": "pick-inspect-place"}),
+    "i2rl/ObjectWorld-v0": ("object_world_environment", 50, {}),
+}
+for _id, (_maker, _steps, _options) in ENVIRONMENTS.items():
+    if _id not in gymnasium.registry:
+        gymnasium.register(_id, f"{_HERE}:{_maker}", max_episode_steps=_steps, kwargs=_options)
