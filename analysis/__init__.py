@@ -63,6 +63,7 @@ _HOMES = {
     ),
     "information": ("complete_information", "expected_information", "observed_information"),
     "invariance": ("Direction", "unidentified_directions"),
+    "label_bias": ("Correlation", "LabelBiasStudy", "correlation"),
     "maps": ("hidden_path", "policy_map"),
     "metrics": (
         "Accuracy",

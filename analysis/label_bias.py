@@ -200,13 +200,13 @@ def study(
     return LabelBiasStudy(
         worlds, trajectories, walls, seed, tuple(results), tuple(etas), sweep,
         drawn[shown] if settings[0].blocked else without_blocked_moves(drawn[shown]), of_world,
-        correlation(of_world.birl, of_world.reward), correlation(of_world.maxent, of_world.reward),
+        correlation(np.asarray(of_world.birl), np.asarray(of_world.reward)),
+        correlation(np.asarray(of_world.maxent), np.asarray(of_world.reward)),
     )  # fmt: skip
 
 
-def correlation(x: Float[Array, " n"], y: Float[Array, " n"]) -> Correlation:
+def correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> Correlation:
     """Pearson's correlation of two samples. Raises ``ValueError`` if one of them is constant."""
-    x, y = np.asarray(x), np.asarray(y)
     if min(_spread(x), _spread(y)) == 0:
         raise ValueError("one of the two samples is constant: there is no correlation to speak of")
     result = stats.pearsonr(x, y)
@@ -231,11 +231,11 @@ def _result(setting: Setting, walked: Trajectories) -> SettingResult:
     rows = []
     for i in range(len(walked.reward)):
         reward = np.asarray(walked.reward[i])
-        pair = [walked.birl[i], walked.maxent[i], walked.choice[i]]
+        scores = [np.asarray(score[i]) for score in (walked.birl, walked.maxent, walked.choice)]
         rows.append([
-            correlation(x, reward) if min(_spread(np.asarray(x)), _spread(reward)) > 0
+            correlation(x, reward) if min(_spread(x), _spread(reward)) > 0
             else Correlation(np.nan, np.nan, np.nan, np.nan, len(reward))
-            for x in pair
+            for x in scores
         ])  # fmt: skip
     birl, maxent, choice = zip(*rows, strict=True)
     return SettingResult(

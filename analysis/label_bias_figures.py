@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 import numpy as np
+from matplotlib.artist import Artist
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
@@ -139,7 +140,9 @@ def draw_sweep(study: LabelBiasStudy, theme: Theme) -> Figure:
     figure = new_figure(theme, 8.2, 4.4)
     axes = figure.subplots()
     limit = _critical(study.per_world)
-    handles = [axes.axhspan(-limit, limit, color=theme.view, zorder=0, label="not significant at 0.05")]
+    handles: list[Artist] = [
+        axes.axhspan(-limit, limit, color=theme.view, zorder=0, label="not significant at 0.05")
+    ]
     names = {True: "BIRL, blocked moves stay put", False: "BIRL, only open moves are actions"}
     for i, (blocked, rho) in enumerate(study.sweep.items(), start=1):
         style = series_style(theme, i)

@@ -1,7 +1,12 @@
-"""What is learned from: patrols and their breach, onion sorting, and a mouse in a labyrinth."""
+"""What is learned from: patrols and their breach, onion sorting, object worlds, a mouse in a labyrinth.
+
+Importing it registers them with Gymnasium; see :mod:`i2rl.domains.environments`.
+"""
 
 from .breach_trials import BreachOutcome, breach_trials, greedy_policies, random_policies, soft_policies
+from .environments import TabularEnv
 from .labyrinth import Bout, Labyrinth, labyrinth, read_bouts, simulate_bouts
+from .object_world import ObjectWorld, object_world, walled_world, without_blocked_moves
 from .patrol import (
     Interaction,
     Patrol,
@@ -29,8 +34,10 @@ __all__ = [
     "Labyrinth",
     "Line",
     "MixedDemonstration",
+    "ObjectWorld",
     "Patrol",
     "Sorting",
+    "TabularEnv",
     "Tally",
     "boyd_fifth_floor",
     "boyd_with_rooms",
@@ -41,6 +48,7 @@ __all__ = [
     "greedy_policies",
     "instance",
     "labyrinth",
+    "object_world",
     "pick_inspect_place",
     "random_policies",
     "read_bouts",
@@ -50,4 +58,6 @@ __all__ = [
     "sort_belts",
     "sorting_with_claiming",
     "sorting_without_claiming",
+    "walled_world",
+    "without_blocked_moves",
 ]

@@ -84,15 +84,16 @@ class TabularEnv(gymnasium.Env[int, int]):
                 f"got {render_mode!r}"
             )
         self.mdp, self.weights, self.strict, self.render_mode = mdp, theta, strict, render_mode
-        self.observation_space = Discrete(mdp.n_states)
-        self.action_space = Discrete(mdp.n_actions)
+        self.observation_space: Discrete = Discrete(mdp.n_states)  # type: ignore[assignment]
+        self.action_space: Discrete = Discrete(mdp.n_actions)  # type: ignore[assignment]
         # NumPy's copies: single look-ups cost JAX a hundred times more.
         self._successors = np.asarray(mdp.successors)
         self._cumulative = np.cumsum(np.asarray(mdp.probabilities), axis=-1)
         self._initial = np.cumsum(np.asarray(mdp.initial))
         self._reward = np.asarray(mdp.features) @ theta
         self._mask = np.asarray(mdp.available).astype(np.int8)
-        self._make_scene, self._scene = scene, None
+        self._make_scene = scene
+        self._scene: Scene | None = None
         self._state: int | None = None
         self._last: tuple[int, float] | None = None
 
@@ -150,7 +151,7 @@ class TabularEnv(gymnasium.Env[int, int]):
         info = {"action_mask": self._mask[self._state].copy(), "available": offered}
         return self._state, reward, False, False, info
 
-    def render(self) -> UInt8[np.ndarray, "height width 3"] | str | None:  # type: ignore[override]
+    def render(self) -> UInt8[np.ndarray, "height width 3"] | str | None:
         """A picture (``rgb_array``), the caption alone (``ansi``), or None without a render mode."""
         if self.render_mode is None:
             gymnasium.logger.warn("render was called without a render_mode; make the environment with one")
@@ -190,15 +191,14 @@ def patrol_environment(number: int = 2, weights: Sequence[float] | None = None, 
 def labyrinth_environment(weights: Sequence[float] | None = None, **options: Any) -> TabularEnv:
     """The mouse; by default reaching the water port earns one, and nothing else anything."""
     maze = labyrinth()
-    if weights is None:
-        weights = np.array([name == f"reaches {WATER_PORT}" for name in maze.mdp.feature_names], float)
+    thirst = np.array([name == f"reaches {WATER_PORT}" for name in maze.mdp.feature_names], float)
 
     def scene() -> Scene:
         from .pictures import labyrinth_scene
 
         return labyrinth_scene(maze)
 
-    return TabularEnv(maze.mdp, weights, scene=scene, **options)
+    return TabularEnv(maze.mdp, thirst if weights is None else weights, scene=scene, **options)
 
 
 _SORTING = {

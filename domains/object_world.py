@@ -91,9 +91,8 @@ def object_world(
     # One seed of NumPy's generator, since a layout may take thousands of draws.
     draws = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     for _ in range(_MOST_DRAWS):
-        layout = np.zeros(size * size, bool)
-        layout[draws.choice(free, walls, replace=False)] = True
-        layout = layout.reshape(size, size)
+        layout = np.zeros((size, size), bool)
+        layout.flat[draws.choice(free, walls, replace=False)] = True
         if _connected(layout):
             return walled_world(layout, objects, weights=weights, slip=slip, discount=discount)
     raise ValueError(

@@ -15,6 +15,7 @@ _HOMES = {
     ),
     "darko": ("darko_i2rl", "ending_at", "feature_margin", "goal_sessions", "stopping_places", "with_end"),
     "dpm": ("DPMBIRL", "DPMTrace", "dpm_birl"),
+    "entropic": ("entropic_proportions",),
     "jin": ("jin_i2rl", "jin_i2rl_with_features", "reward_correction", "with_state_features"),
     "journal": ("Journal", "JournalBusy", "JournalError", "JournalView", "Position", "SessionRecord"),
     "lme": (
@@ -41,6 +42,13 @@ _HOMES = {
         "fit_weights",
     ),
     "policy_walk": ("birl",),
+    "minmax": ("MinMaxProgram", "MinMaxSolution"),
+    "minmax_printed": (
+        "TrajectorySpace",
+        "ascend_printed",
+        "coded_assignment_gradient",
+        "printed_assignment_gradient",
+    ),
     "posterior": ("sample_posterior",),
     "schedule": ("Harmonic",),
     "session": (

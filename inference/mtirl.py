@@ -1,0 +1,363 @@
+"""Min-max-entropy multi-task IRL (chapter 5): several ways of doing a task, from one jumble of trajectories.
+
+Batch and online. How many ways there are, who did what, and the reward of each are learned together, by
+the alternation of :mod:`.mixture_fit`; :mod:`.minmax` poses the same program as one. The gradient for the
+assignments that the dissertation prints cannot cluster: :mod:`.minmax_printed` shows it.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ..models.demonstration import Demonstration, DemonstrationError
+from ..models.evidence import Imperfection, Sensor, require_possible
+from ..models.mdp import TabularMDP
+from ..models.planning import reachable_states, require_discounted
+from .clustering import Clustering
+from .jumble import Jumble, is_seen_whole, seen_in_part, seen_whole
+from .lme import _digest
+from .mixture_fit import Kept, Mixture, MixtureProgram, empty_mixture, log_policies, nothing_kept, search
+from .session import Learner
+
+DEFAULT_WAYS = 4
+DEFAULT_RESTARTS = 4
+# Experts are decided: a prior of scale 7 on each weight admits one who errs once in a thousand choices.
+DEFAULT_RIDGE = 0.02
+
+
+class MixtureState(NamedTuple):
+    """What online MME-MTIRL carries from session to session (section 5.2). Empty slots have no mass.
+
+    Fields
+    ------
+    weights : float ``[D, K]``
+        Reward weights of each way, ``theta_d``.
+    values : float ``[D, S]``
+        Their soft values: planning's warm start.
+    proportions : float ``[D]``
+        Mixture weights ``pi_d``.
+    mass : float ``[D]``
+        ``sum_i v_{d,i}`` over all trajectories so far; it sums to their number.
+    visits : float ``[D, S, A]``
+        ``sum_i v_{d,i} N_i(s, a)``, visits of seen steps. ``|X| phi_hat_d`` of Eq. 5.8 is its product with
+        the features; adding to the two sums is Eq. 5.7 and 5.8.
+    session : int
+        Sessions so far.
+    key : random key
+    """
+
+    weights: Float[Array, "D K"]
+    values: Float[Array, "D S"]
+    proportions: Float[Array, " D"]
+    mass: Float[Array, " D"]
+    visits: Float[Array, "D S A"]
+    session: Int[Array, ""]
+    key: Array
+
+
+class MixtureReport(NamedTuple):
+    """What a session did; fields as in :class:`.session.Report`, where not said otherwise.
+
+    Fields
+    ------
+    session : int
+    log_likelihood : float
+        Of all that is kept, in nats per trajectory, dynamics left out: each trajectory under its own way,
+        and of the way under the proportions.
+    demonstration_log_likelihood : float
+        Exact log-likelihood of this session's trajectories under the mixture, dynamics included.
+    gradient : float
+        Norm over all ways of the log-likelihood's gradient at the weights the session began with.
+    iterations, solver_iterations : int
+        Of the alternation and of the programs' solver, in the start that was kept.
+    seconds : float
+    weights : float ``[D, K]``
+    proportions : float ``[D]``
+        Zero for empty slots.
+    ways : int
+        How many there are now.
+    starts : int
+        How many starts were tried; one when nothing suggested a new way.
+    assignments : int ``[n]``
+        The likeliest way of each of this session's trajectories.
+    responsibilities : float ``[n, D]``
+    """
+
+    session: int
+    log_likelihood: float
+    demonstration_log_likelihood: float
+    gradient: float
+    iterations: int
+    solver_iterations: int
+    seconds: float
+    weights: Float[np.ndarray, "D K"]
+    proportions: Float[np.ndarray, " D"]
+    ways: int
+    starts: int
+    assignments: Int[np.ndarray, " n"]
+    responsibilities: Float[np.ndarray, "n D"]
+
+
+def mme_mtirl(
+    mdp: TabularMDP,
+    sensor: Imperfection | None = None,
+    *,
+    ways: int = DEFAULT_WAYS,
+    strength: float = 1.0,
+    price: float = 0.5,
+    l1: float = 0.0,
+    ridge: float = DEFAULT_RIDGE,
+    restarts: int = DEFAULT_RESTARTS,
+    iterations: int = 50,
+    tolerance: float = 1e-6,
+) -> Learner:
+    """Online MME-MTIRL: a session learns from its own trajectories and the statistic of earlier ones (5.2).
+
+    A session first explains its trajectories by the ways known so far. Where that is so bad that a new way
+    could pay for itself, the empty slots are tried too, so that a way that first appears late is found.
+
+    Parameters
+    ----------
+    mdp : TabularMDP
+        The task without its reward; discount below 1.
+    sensor : Imperfection, optional
+        What is hidden or misread; without it everything is seen.
+    ways : int
+        Most ways there can be at a time, ``D``.
+    strength : float
+        ``lambda`` of the entropic prior on the proportions, ``exp(-lambda H(pi))``: the min-entropy half of
+        program (5.1). The dissertation's is 1.
+    price : float
+        Share of the information of who did what that a further way must buy; see :mod:`.mixture_fit`. 1 is
+        the likelihood's own; less prefers several decided ways to one undecided.
+    l1, ridge : float
+        Rate of a Laplace and precision of a Gaussian prior on each weight (nats in all, not per trajectory).
+    restarts : int
+        Seedings of the empty slots that are tried.
+    iterations, tolerance : int, float
+        A climb ends after so many alternations, or when one gains less than ``tolerance`` nats.
+
+    Returns
+    -------
+    Learner
+        ``update(state, demonstration)`` gives a :class:`MixtureState` and a :class:`MixtureReport`. Raises
+        :class:`DemonstrationError` naming trajectory and step for what the model rules out, an action that
+        is not available in its state among it; the state it was given stays valid.
+
+    Raises
+    ------
+    ValueError
+        For discount 1, fewer than one way, or negative penalties.
+    """
+    sensor = Sensor() if sensor is None else sensor
+    program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
+    configuration = {
+        "ways": ways, "strength": strength, "price": price, "l1": l1, "ridge": ridge, "restarts": restarts,
+        "iterations": iterations, "tolerance": tolerance, "sensor": _digest(sensor),
+    }  # fmt: skip
+
+    def run(state: MixtureState, jumble: Jumble) -> tuple[MixtureState, MixtureReport]:
+        return _session(program, restarts, state, jumble)
+
+    compiled = jax.jit(run)
+    whole, in_part = (jax.jit(partial(f, mdp, sensor)) for f in (seen_whole, seen_in_part))
+
+    def session(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
+        return run(state, seen_in_part(mdp, sensor, demonstration))
+
+    def init(key: Array) -> MixtureState:
+        empty, kept = empty_mixture(mdp, ways), nothing_kept(mdp, ways)
+        return MixtureState(*empty, *kept, jnp.zeros((), int), key)
+
+    def update(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
+        began = time.perf_counter()
+        rows = _rows(demonstration)
+        padded = demonstration.bucketed()
+        jumble = whole(padded) if is_seen_whole(sensor, demonstration) else in_part(padded)
+        new, report = compiled(state, jumble)
+        if not np.isfinite(report.demonstration_log_likelihood):
+            _explain_impossible(sensor, mdp, demonstration)
+        arrays = {name: np.asarray(value) for name, value in report._asdict().items()}
+        arrays["assignments"] = arrays["assignments"][rows]
+        arrays["responsibilities"] = arrays["responsibilities"][rows]
+        plain: dict[str, Any] = {name: x if x.ndim else x.item() for name, x in arrays.items()}
+        return new, MixtureReport(**plain | {"seconds": time.perf_counter() - began})
+
+    @jax.jit
+    def likelihood(state: MixtureState, weights: Float[Array, "D K"]) -> Float[Array, ""]:
+        policies, _ = log_policies(mdp, weights, state.values)
+        known = jnp.sum(state.visits * jnp.where(mdp.available, policies, 0.0))
+        return known / jnp.maximum(jnp.sum(state.mass), 1.0)
+
+    def log_likelihood(state: MixtureState, weights: Float[Array, "D K"]) -> float:
+        return float(likelihood(state, jnp.asarray(weights, float)))
+
+    return Learner(
+        "online MME-MTIRL",
+        mdp,
+        configuration,
+        init,
+        update,  # type: ignore[arg-type]
+        session,  # type: ignore[arg-type]
+        log_likelihood,
+    )
+
+
+class BatchMixture(NamedTuple):
+    """Batch multi-task IRL; ``fit(key, demonstration)`` uses all trajectories at once."""
+
+    name: str
+    fit: Callable[[Array, Demonstration], Clustering]
+
+
+def batch_mme_mtirl(
+    mdp: TabularMDP,
+    sensor: Imperfection | None = None,
+    *,
+    ways: int = DEFAULT_WAYS,
+    strength: float = 1.0,
+    price: float = 0.5,
+    l1: float = 0.0,
+    ridge: float = DEFAULT_RIDGE,
+    restarts: int = DEFAULT_RESTARTS,
+    iterations: int = 50,
+    tolerance: float = 1e-6,
+) -> BatchMixture:
+    """Batch MME-MTIRL (section 5.1): the alternation from several seedings of ``ways`` ways, best one kept.
+
+    Parameters as for :func:`mme_mtirl`. The :class:`Clustering` has the ways that were found, the largest
+    first, and the min-max-entropy program's objective ``J``. With fewer trajectories than ``ways``, there
+    is a warning, and at most one way a trajectory. ``fit`` raises :class:`DemonstrationError` as
+    :func:`mme_mtirl` does.
+    """
+    sensor = Sensor() if sensor is None else sensor
+    program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
+    whole, in_part = (jax.jit(partial(f, mdp, sensor)) for f in (seen_whole, seen_in_part))
+
+    @jax.jit
+    def run(key: Array, jumble: Jumble) -> Any:
+        return search(
+            program, jumble, nothing_kept(mdp, ways), empty_mixture(mdp, ways), key, restarts - 1
+        ).fit
+
+    def fit(key: Array, demonstration: Demonstration) -> Clustering:
+        rows = _rows(demonstration)
+        if len(rows) < ways:
+            warnings.warn(
+                f"{ways} ways were to be started from, but there are {len(rows)} trajectories: no more ways "
+                "than that can be found",
+                stacklevel=2,
+            )
+        padded = demonstration.bucketed()
+        found = run(key, whole(padded) if is_seen_whole(sensor, demonstration) else in_part(padded))
+        if not np.isfinite(found.objective):
+            _explain_impossible(sensor, mdp, demonstration)
+        proportions = np.asarray(found.mixture.proportions)
+        order = np.argsort(-proportions, kind="stable")[: np.count_nonzero(proportions)]
+        return Clustering(
+            np.asarray(found.mixture.weights)[order],
+            proportions[order],
+            np.asarray(found.responsibilities)[rows][:, order],
+            float(found.objective),
+        )
+
+    return BatchMixture("MME-MTIRL", fit)
+
+
+def clustering_of(state: MixtureState, report: MixtureReport) -> Clustering:
+    """What an online learner has found, with the assignments of its last session; largest way first."""
+    proportions = np.asarray(state.proportions)
+    order = np.argsort(-proportions, kind="stable")[: np.count_nonzero(proportions)]
+    return Clustering(
+        np.asarray(state.weights)[order],
+        proportions[order],
+        np.asarray(report.responsibilities)[:, order],
+        float(report.log_likelihood) * float(np.sum(state.mass)),
+    )
+
+
+# -- building blocks ----------------------------------------------------------------------------------
+
+
+def _program(
+    mdp: TabularMDP,
+    ways: int,
+    strength: float,
+    price: float,
+    l1: float,
+    ridge: float,
+    restarts: int,
+    iterations: int,
+    tolerance: float,
+) -> MixtureProgram:
+    require_discounted(mdp)
+    for name, number in (("ways", ways), ("restarts", restarts), ("iterations", iterations)):
+        if number < 1:
+            raise ValueError(f"{name} must be at least 1, got {number}")
+    for name, value in (("strength", strength), ("price", price), ("l1", l1), ("ridge", ridge)):
+        if not value >= 0:
+            raise ValueError(f"{name} must not be negative, got {value}")
+    reachable = jnp.asarray(reachable_states(mdp))
+    return MixtureProgram(mdp, reachable, strength, l1, ridge, price, iterations, tolerance)
+
+
+def _rows(demonstration: Demonstration) -> Int[np.ndarray, " n"]:
+    """Rows that are trajectories rather than padding."""
+    rows = np.flatnonzero(demonstration.lengths)
+    if not len(rows):
+        raise DemonstrationError("multi-task learning needs at least one trajectory with a step")
+    return rows
+
+
+def _explain_impossible(sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration) -> None:
+    require_possible(sensor, mdp, demonstration)
+    raise DemonstrationError("a trajectory has probability zero under every way of doing the task")
+
+
+def _session(
+    program: MixtureProgram, restarts: int, state: MixtureState, jumble: Jumble
+) -> tuple[MixtureState, MixtureReport]:
+    mdp = program.mdp
+    key, seed = jax.random.split(state.key)
+    kept = Kept(state.mass, state.visits)
+    mixture = Mixture(state.weights, state.values, state.proportions)
+    found = search(program, jumble, kept, mixture, seed, restarts)
+    fit = found.fit
+    mass = fit.kept.mass + jnp.sum(fit.responsibilities, axis=0)
+    learned = MixtureState(*fit.mixture, mass, fit.kept.visits + fit.seen, state.session + 1, key)
+
+    def known(weights: Float[Array, "D K"]) -> Float[Array, ""]:
+        policies, _ = log_policies(mdp, weights, fit.mixture.values)
+        return jnp.sum(learned.visits * jnp.where(mdp.available, policies, 0.0))
+
+    total = jnp.sum(mass)
+    present = fit.mixture.proportions > 0
+    log_proportions = jnp.log(jnp.where(present, fit.mixture.proportions, 1.0))
+    own = jnp.sum(fit.log_likelihood)
+    fields: dict[str, Any] = {
+        "session": state.session + 1,
+        "log_likelihood": (known(fit.mixture.weights) + mass @ log_proportions) / jnp.maximum(total, 1.0),
+        "demonstration_log_likelihood": own,
+        "gradient": jnp.linalg.norm(jax.grad(known)(state.weights)) / jnp.maximum(total, 1.0),
+        "iterations": fit.iterations,
+        "solver_iterations": fit.solver_iterations,
+        "seconds": jnp.array(jnp.nan),
+        "weights": fit.mixture.weights,
+        "proportions": fit.mixture.proportions,
+        "ways": jnp.sum(present),
+        "starts": found.tried,
+        "assignments": jnp.argmax(fit.responsibilities, axis=1),
+        "responsibilities": fit.responsibilities,
+    }
+    # An observation that cannot be must not spoil what was learned (a fleet raises nothing).
+    possible = jnp.isfinite(own)
+    return jax.tree.map(partial(jnp.where, possible), learned, state), MixtureReport(**fields)
