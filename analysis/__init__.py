@@ -80,6 +80,12 @@ _HOMES = {
         "policy_error",
         "quantile_band",
     ),
+    "multi_task_metrics": (
+        "adjusted_rand_index",
+        "assignment_accuracy",
+        "expected_value_difference",
+        "match_ways",
+    ),
     "online_methods": ("methods_table", "turning_places"),
     "predictive": ("predictive_check", "predictive_visits"),
     "regret": (
