@@ -49,6 +49,9 @@ _HOMES = {
         "coded_assignment_gradient",
         "printed_assignment_gradient",
     ),
+    "mixture_gibbs": ("gibbs_mixture_posterior",),
+    "mixture_posterior": ("sample_mixture_posterior",),
+    "mixture_problem": ("label_invariant",),
     "posterior": ("sample_posterior",),
     "schedule": ("Harmonic",),
     "session": (

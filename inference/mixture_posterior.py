@@ -23,10 +23,7 @@ from numpyro.infer.hmc import HMCState
 from ..models.demonstration import Demonstration
 from ..models.evidence import Imperfection
 from ..models.mdp import TabularMDP
-from ..models.mixture import (
-    COMPONENTS,
-    stick_proportions,
-)
+from ..models.mixture import COMPONENTS, stick_proportions
 from .mixture_problem import (
     MixtureProblem,
     Position,
@@ -92,8 +89,9 @@ def nuts_mixture_chain(
         )
 
     state = kernel.init(key, warmup, start, (), {})
-    state, _ = lax.scan(lambda s, _: (advance(s, None)[0], None), state, None, warmup)
-    return lax.scan(advance, state, None, draws)[1]
+    # One scan, its beginning dropped, compiles in half the time of two.
+    chain: MixtureChain = lax.scan(advance, state, None, warmup + draws)[1]
+    return jax.tree.map(lambda x: x[warmup:], chain)
 
 
 def constrained(position: Position, problem: MixtureProblem) -> tuple[Array, Array, Array]:
@@ -221,4 +219,5 @@ def sample_mixture_posterior(
     stats = {name: getattr(chain, name) for name in MixtureChain._fields[3:]}
     stats |= {"tree_depth": depth, "reached_max_treedepth": chain.n_steps >= 2**max_tree_depth - 1}
     method = "NUTS over weights and proportions, assignments and hidden steps summed out; exact assignments"
-    return mixture_data(key, problem, demonstration, present, chain[:3], resolved, stats, method)
+    drawn = tuple(np.asarray(x) for x in chain[:3])
+    return mixture_data(key, problem, demonstration, present, drawn, resolved, stats, method)

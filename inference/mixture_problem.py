@@ -169,7 +169,8 @@ def starts(key: Array, problem: MixtureProblem, chains: int, most: int) -> list[
     points = np.asarray(_mean_features(problem))
     points = points / np.maximum(points.std(0), 1e-12)
     most = min(most, _MOST_STARTING_WAYS, len(points))
-    one_way = problem._replace(concentration=jnp.ones(()))
+    # One way's density knows neither the concentration nor how many trajectories there are.
+    one_way = problem._replace(concentration=jnp.ones(()), rows=problem.rows[:0])
     rows, size = np.asarray(problem.rows), len(problem.perceived.repeats)
 
     def climb(members: Int[np.ndarray, " i"]) -> Float[np.ndarray, " D"]:

@@ -18,6 +18,7 @@ from .demonstration import (
 )
 from .evidence import Imperfection, ObservationModel, Sensor, Visibility, log_evidence, require_possible
 from .mdp import TabularMDP
+from .mixture import MixtureLaw, mixture_model, stick_proportions, truncation_error
 from .occlusion import occlusion_model, weights_prior
 from .planning import (
     FinitePlan,
@@ -47,6 +48,7 @@ __all__ = [
     "FinitePlan",
     "HardPlan",
     "Imperfection",
+    "MixtureLaw",
     "ObservationModel",
     "Record",
     "Sensor",
@@ -65,6 +67,7 @@ __all__ = [
     "hard_plan",
     "load_mdp",
     "log_evidence",
+    "mixture_model",
     "occlusion_model",
     "occupancy",
     "policy_values",
@@ -76,6 +79,8 @@ __all__ = [
     "save_mdp",
     "simulate",
     "soft_plan",
+    "stick_proportions",
+    "truncation_error",
     "weights_prior",
     "write_trajectories",
 ]

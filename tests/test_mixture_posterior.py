@@ -19,7 +19,8 @@ from i2rl.inference.mixture_problem import label_invariant, log_partition
 from i2rl.models import Demonstration, DemonstrationError, TabularMDP, TrajectoryLaw, Visibility
 from i2rl.models.mixture import component_log_likelihoods, mixture_model, perceive, soft_policies
 
-N, LENGTH, ALPHA, SD = 6, 6, 0.5, 1.5
+N, LENGTH, SD = 6, 6, 1.5
+ALPHA = dist.Gamma(6.0, 10.0)
 OPTIONS = {"components": 10, "concentration": ALPHA, "prior": dist.Normal(0.0, SD), "chains": 2}
 SAMPLERS = {
     "nuts": partial(sample_mixture_posterior, **OPTIONS, draws=700, warmup=300),
@@ -54,7 +55,7 @@ def sensor():
 def demonstration(mdp, sensor):
     """Three trajectories of each of two ways; some are hidden in places, a frame is lost, one is short."""
     codes = np.concatenate([
-        np.asarray(TrajectoryLaw(mdp, jnp.array(w), sensor, LENGTH).sample(jax.random.key(seed), (3,)))
+        np.asarray(simulated(jax.random.key(seed), mdp, jnp.array(w), sensor, 3))
         for seed, w in ((2, [1.0, -3.0]), (3, [-1.0, 3.0]))
     ])  # fmt: skip
     codes[1, 2] = [3, -1, -1]
@@ -69,8 +70,28 @@ def idata(request, mdp, sensor, demonstration):
     return SAMPLERS[request.param](jax.random.key(0), mdp, sensor, demonstration)
 
 
+@partial(jax.jit, static_argnames="n")
+def simulated(key, mdp, weights, sensor, n):
+    return TrajectoryLaw(mdp, weights, sensor, LENGTH).sample(key, (n,))
+
+
+@jax.jit
+def log_probabilities(mdp, weights, sensor, codes):
+    """Of each trajectory done in a way of its own."""
+    return jax.lax.map(lambda x: TrajectoryLaw(mdp, x[0], sensor, LENGTH).log_prob(x[1]), (weights, codes))
+
+
+@jax.jit
+def log_likelihood(mdp, sensor, codes, sites):
+    """Of the declared model: its density without that of its prior."""
+    options = {"components": len(sites["weights"]), "concentration": ALPHA, "prior": OPTIONS["prior"]}
+    prior = ALPHA.log_prob(sites["concentration"]) + OPTIONS["prior"].log_prob(sites["weights"]).sum()
+    prior += dist.Beta(1.0, sites["concentration"]).log_prob(sites["sticks"]).sum()
+    return log_density(mixture_model, (mdp, sensor, codes), options, sites)[0] - prior
+
+
 class Exact(NamedTuple):
-    """Posterior by enumeration: partitions as labels ``[P, n]`` and their log-evidence, and grid tables."""
+    """Every partition, as labels ``[P, n]``; its log-evidence ``[P]``; mean weights in it ``[P, n, K]``."""
 
     partitions: np.ndarray
     log_evidence: np.ndarray
@@ -117,14 +138,25 @@ def exact(mdp, sensor, demonstration):
     return enumerate_partitions(mdp, sensor, demonstration, log_prior, np.linspace(-8.0, 8.0, 61))
 
 
+CONCENTRATIONS = np.linspace(0, 4, 401)[1:] - 0.005
+
+
 def process(partitions, alpha):
-    """Log-probability of each partition under the Chinese restaurant process, seat by seat."""
-    logs = np.zeros(len(partitions))
+    """Log-probability of each partition under the Chinese restaurant process, seat by seat; ``[P, ...]``."""
+    logs = np.zeros((len(partitions), *np.shape(alpha)))
     for p, labels in enumerate(partitions):
         for i, d in enumerate(labels):
             sitting = (labels[:i] == d).sum()
             logs[p] += np.log((sitting or alpha) / (i + alpha))
     return logs
+
+
+def weighed(partitions, log_evidence=0.0):
+    """Probability of each partition, and mean concentration."""
+    logs = process(partitions, CONCENTRATIONS) + np.asarray(ALPHA.log_prob(CONCENTRATIONS))
+    logs = logs + np.reshape(log_evidence, (-1, 1))
+    posterior = np.exp(logs - logsumexp(logs))
+    return posterior.sum(1), posterior.sum(0) @ CONCENTRATIONS
 
 
 def assert_mean(draws, expected, floor=1e-3):
@@ -152,8 +184,7 @@ def test_the_process_scores_a_partition_seat_by_seat():
 
 
 def test_partitions_and_weights_agree_with_enumeration(idata, exact):
-    logs = exact.log_evidence + process(exact.partitions, ALPHA)
-    posterior = np.exp(logs - logsumexp(logs))
+    posterior, concentration = weighed(exact.partitions, exact.log_evidence)
     together = exact.partitions[:, :, None] == exact.partitions[:, None, :]
     expected = np.einsum("p,pij->ij", posterior, together)
     assert ((expected > 0.02) & (expected < 0.98)).sum() > 10
@@ -165,6 +196,7 @@ def test_partitions_and_weights_agree_with_enumeration(idata, exact):
     ways = exact.partitions.max(1) + 1
     for k in (1, 2, 3):
         assert_mean(idata.assignments.n_ways == k, posterior[ways == k].sum())
+    assert_mean(idata.posterior.concentration, concentration)
     weights = np.einsum("p,pnk->nk", posterior, exact.trajectory_weights)
     drawn = label_invariant(idata).trajectory_weights
     assert drawn.dims == ("chain", "draw", "trajectory", "feature")
@@ -193,16 +225,22 @@ def test_without_information_partitions_follow_the_process(demonstration, sensor
     """Nobody wants anything: features are zero, and the posterior is the prior."""
     indifferent = ring(np.zeros((4, 2, 2)))
     partitions = partitions_of(N)
-    chance, ways = np.exp(process(partitions, ALPHA)), partitions.max(1) + 1
+    (chance, _), ways = weighed(partitions), partitions.max(1) + 1
     for sample in SAMPLERS.values():
         idata = sample(jax.random.key(1), indifferent, sensor, demonstration)
         for k in range(1, 5):
             assert_mean(idata.assignments.n_ways == k, chance[ways == k].sum())
-        assert_mean(shared_ways(idata)[..., 0, 4], 1 / (1 + ALPHA))
-        assert_mean(idata.posterior.proportions.values.max(-1) > 2, 0.0)
+        assert_mean(shared_ways(idata)[..., 0, 4], chance[partitions[:, 0] == partitions[:, 4]].sum())
+        assert_mean(idata.posterior.concentration, 0.6)
+        assert_mean((idata.posterior.proportions**2).sum("component"), self_meeting())
         weights = label_invariant(idata).trajectory_weights.values
         assert_mean(weights[..., 0, 0], 0.0)
         assert_mean(weights[..., 3, 1] ** 2, SD**2)
+
+
+def self_meeting():
+    """Expected sum of squared proportions: the probability that two more trajectories share a way."""
+    return integrate.quad(lambda a: np.exp(float(ALPHA.log_prob(a))) / (1 + a), 0, 5)[0]
 
 
 def test_identical_trajectories_are_exchangeable(mdp, sensor, demonstration, exact):
@@ -218,21 +256,18 @@ def test_identical_trajectories_are_exchangeable(mdp, sensor, demonstration, exa
         assert_mean(shared[..., 0, 3].astype(float) - shared[..., 2, 5], 0.0)
 
 
-def test_one_trajectory_tells_nothing_of_the_concentration(mdp, sensor, demonstration):
-    alpha, half = dist.Gamma(3.0, 4.0), dist.HalfNormal(1.5)
-    one = demonstration.select([1])
+def test_one_trajectory_under_a_prior_on_positive_weights(mdp, sensor, demonstration):
+    half, one = dist.HalfNormal(1.5), demonstration.select([1])
     axis = np.linspace(0, 7, 141)[1:] - 0.025
     exact = enumerate_partitions(mdp, sensor, one, lambda w: half.log_prob(w).sum(-1), axis)
-    options = {"concentration": alpha, "prior": half, "chains": 2, "components": 3, "draws": 500}
-    for sample in (sample_mixture_posterior, partial(gibbs_mixture_posterior, thin=2)):
-        idata = sample(jax.random.key(3), mdp, sensor, one, **options)
-        assert (idata.assignments.n_ways == 1).all()
-        assert idata.assignments.co_clustering.values == [[1.0]]
-        assert_mean(idata.posterior.concentration, 0.75)
-        assert_mean(idata.posterior.concentration**2, 0.75)
-        weights = label_invariant(idata).trajectory_weights
-        for k in range(2):
-            assert_mean(weights[..., 0, k], exact.trajectory_weights[0, 0, k])
+    options = {"concentration": 0.8, "prior": half, "chains": 2, "components": 3, "draws": 500, "thin": 2}
+    idata = gibbs_mixture_posterior(jax.random.key(3), mdp, sensor, one, **options)
+    assert (idata.assignments.n_ways == 1).all()
+    assert idata.assignments.co_clustering.values == [[1.0]]
+    assert "concentration" not in idata.posterior
+    weights = label_invariant(idata).trajectory_weights
+    for k in range(2):
+        assert_mean(weights[..., 0, k], exact.trajectory_weights[0, 0, k])
 
 
 def test_the_concentration_moves_towards_its_conditional():
@@ -257,20 +292,16 @@ def test_draws_are_those_of_the_declared_model(idata, mdp, sensor, demonstration
     assert idata.posterior.weights.dims == ("chain", "draw", "component", "feature")
     np.testing.assert_allclose(idata.posterior.proportions.sum("component"), 1.0)
     sticks = jnp.asarray(proportions[:-1] / (1 - np.concatenate([[0], proportions[:-2].cumsum()])))
-    options = {"components": len(proportions), "concentration": ALPHA, "prior": OPTIONS["prior"]}
-    total, _ = log_density(
-        mixture_model, (mdp, sensor, demonstration.codes), options, {"weights": weights, "sticks": sticks}
-    )
-    prior = dist.Beta(1.0, ALPHA).log_prob(sticks).sum() + dist.Normal(0.0, SD).log_prob(weights).sum()
+    alpha = float(idata.posterior.concentration[1, 3])
+    sites = {"weights": weights, "sticks": sticks, "concentration": alpha}
     drawn = idata.log_likelihood.demonstration[1, 3].sum()
-    np.testing.assert_allclose(drawn, total - prior, rtol=1e-8)
+    expected = log_likelihood(mdp, sensor, jnp.asarray(demonstration.codes), sites)
+    np.testing.assert_allclose(drawn, expected, rtol=1e-8)
     ways = idata.assignments.assignment.values[1, 3]
     used, labels = np.unique(ways, return_inverse=True)
-    joint = process(labels[None], ALPHA)[0] + dist.Normal(0.0, SD).log_prob(weights[used]).sum()
-    joint += sum(
-        TrajectoryLaw(mdp, weights[d], sensor, LENGTH).log_prob(jnp.asarray(demonstration.codes[i]))
-        for i, d in enumerate(ways)
-    )
+    joint = process(labels[None], alpha)[0] + dist.Normal(0.0, SD).log_prob(weights[used]).sum()
+    joint += ALPHA.log_prob(alpha)
+    joint += log_probabilities(mdp, weights[ways], sensor, jnp.asarray(demonstration.codes)).sum()
     np.testing.assert_allclose(idata.assignments.log_joint[1, 3], joint, rtol=1e-8)
 
 
