@@ -3,6 +3,7 @@
 Importing it registers them with Gymnasium; see :mod:`i2rl.domains.environments`.
 """
 
+from .breach_environment import BreachEnv
 from .breach_trials import BreachOutcome, breach_trials, greedy_policies, random_policies, soft_policies
 from .environments import TabularEnv
 from .labyrinth import Bout, Labyrinth, labyrinth, read_bouts, simulate_bouts
@@ -29,6 +30,7 @@ from .sorting_line import Line, Tally, sort_belts
 
 __all__ = [
     "Bout",
+    "BreachEnv",
     "BreachOutcome",
     "Interaction",
     "Labyrinth",

@@ -7,10 +7,13 @@
 ``i2rl/SortingWithoutClaiming-v0``      onion sorting, 23 states; likewise
 ``i2rl/PickInspectPlace-v0``            onion sorting, 22 states
 ``i2rl/ObjectWorld-v0``                 a walled grid; ``layout`` seeds its walls
+``i2rl/Breach2-v0``, ``Breach3-v0``     the learner's way past the patrollers; ``observability`` its view
 ======================================  ================================================================
 
-All take ``weights``, the reward ``weights . phi(s, a)`` (by default the domain's true ones). Episodes never
-terminate; they are truncated after the steps given at registration (``max_episode_steps``).
+Those with a :class:`TabularMDP` are :class:`TabularEnv` and take ``weights``, the reward ``weights .
+phi(s, a)`` (by default the domain's true ones). Their episodes never terminate; they are truncated after the
+steps given at registration (``max_episode_steps``). A breach is :class:`BreachEnv` and ends at a goal or when
+the learner is seen.
 """
 
 from __future__ import annotations
@@ -31,6 +34,7 @@ from .patrol import instance
 from .sorting import Sorting, pick_inspect_place, sorting_with_claiming, sorting_without_claiming
 
 if TYPE_CHECKING:
+    from .breach_environment import BreachEnv
     from .pictures import Scene
 
 
@@ -260,6 +264,13 @@ def object_world_environment(
     return TabularEnv(world.mdp, world.weights if weights is None else weights, scene=scene, **options)
 
 
+def breach_environment(number: int = 2, **options: Any) -> BreachEnv:
+    """The breach of an instance; other options as :class:`BreachEnv`."""
+    from .breach_environment import BreachEnv
+
+    return BreachEnv(instance(number), **options)
+
+
 _HERE = __name__
 ENVIRONMENTS: dict[str, tuple[str, int, dict[str, Any]]] = {
     "i2rl/Patrol1-v0": ("patrol_environment", 200, {"number": 1}),
@@ -270,6 +281,9 @@ ENVIRONMENTS: dict[str, tuple[str, int, dict[str, Any]]] = {
     "i2rl/SortingWithoutClaiming-v0": ("sorting_environment", 50, {"process": "without claiming"}),
     "i2rl/PickInspectPlace-v0": ("sorting_environment", 50, {"process": "pick-inspect-place"}),
     "i2rl/ObjectWorld-v0": ("object_world_environment", 50, {}),
+    # Two rounds of the patrol to leave in, and sixty steps for the way.
+    "i2rl/Breach2-v0": ("breach_environment", 172, {"number": 2}),
+    "i2rl/Breach3-v0": ("breach_environment", 188, {"number": 3}),
 }
 for _id, (_maker, _steps, _options) in ENVIRONMENTS.items():
     if _id not in gymnasium.registry:

@@ -1,4 +1,4 @@
-"""Pictures of where an agent is: the patrol's floor, the maze, the sorting table, the object world.
+"""Pictures of where an agent is: a patrol's floor, the maze, the sorting table, the object world.
 
 A :class:`Scene` draws what stands still once; a frame then costs some milliseconds. Builders take a domain
 and give its scene.
@@ -16,12 +16,13 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Circle, Polygon, Rectangle
 
 from ..models.mdp import TabularMDP
 from .labyrinth import HOME, LEVELS, N_NODES, WATER_PORT, Labyrinth, parent_of
 from .object_world import ObjectWorld
-from .patrol import Patrol
+from .patrol import Patrol, State
 
 DPI = 100
 # Okabe and Ito (2008): told apart by people who do not see red and green alike.
@@ -37,21 +38,11 @@ class Frame(NamedTuple):
     reward: float | None = None
 
 
-class Scene:
-    """A picture whose background is drawn once, and artists that ``place`` moves to where a state is.
+class Backdrop:
+    """What stands still, drawn once, with artists and a caption that change from picture to picture."""
 
-    ``moving`` are the artists that ``place`` changes; ``figure`` holds them and everything that stands still.
-    """
-
-    def __init__(
-        self,
-        axes: Axes,
-        mdp: TabularMDP,
-        moving: Sequence[Artist],
-        place: Callable[[int], None],
-        columns: int,
-    ):
-        self._mdp, self._axes, self._place, self._columns = mdp, axes, place, columns
+    def __init__(self, axes: Axes, moving: Sequence[Artist]):
+        self._axes = axes
         self._caption = axes.text(
             0.02, 0.015, "", transform=axes.transAxes, fontsize=9, color=INK, va="bottom"
         )
@@ -62,14 +53,36 @@ class Scene:
         self._canvas.draw()
         self._background = self._canvas.copy_from_bbox(axes.figure.bbox)
 
-    def frame(self, shown: Frame) -> UInt8[np.ndarray, "height width 3"]:
-        """The picture of a state as red, green and blue from 0 to 255."""
+    def picture(self, caption: str) -> UInt8[np.ndarray, "height width 3"]:
+        """Everything as it is now, in red, green and blue from 0 to 255."""
         self._canvas.restore_region(self._background)
-        self._place(shown.state)
-        self._caption.set_text(caption(self._mdp, shown, self._columns))
+        self._caption.set_text(caption)
         for artist in sorted(self._moving, key=Artist.get_zorder):
             self._axes.draw_artist(artist)
         return np.array(self._canvas.buffer_rgba())[..., :3].copy()
+
+
+class Scene:
+    """A backdrop for a decision process, and artists that ``place`` moves to where a state is.
+
+    ``moving`` are the artists that ``place`` changes; ``columns`` is how many characters fit in a line.
+    """
+
+    def __init__(
+        self,
+        axes: Axes,
+        mdp: TabularMDP,
+        moving: Sequence[Artist],
+        place: Callable[[int], None],
+        columns: int,
+    ):
+        self._mdp, self._place, self._columns = mdp, place, columns
+        self._backdrop = Backdrop(axes, moving)
+
+    def frame(self, shown: Frame) -> UInt8[np.ndarray, "height width 3"]:
+        """The picture of a state."""
+        self._place(shown.state)
+        return self._backdrop.picture(caption(self._mdp, shown, self._columns))
 
 
 def caption(mdp: TabularMDP, shown: Frame, columns: int = 10_000) -> str:
@@ -95,12 +108,28 @@ def _cell(axes: Axes, row: int, column: int, color: str) -> None:
     axes.add_patch(Rectangle((column - 0.5, row - 0.5), 1, 1, facecolor=color, edgecolor=PAGE, linewidth=1.2))
 
 
-def _number(axes: Axes, rows: range, columns: range) -> None:
+def _key(axes: Axes, marks: Sequence[tuple[str, str, str]], columns: int = 4) -> None:
+    """What marks mean, above everything: (marker, colour, meaning), so many side by side."""
+    handles = []
+    for marker, color, meaning in marks:
+        handle = Line2D([], [], linestyle="", marker=marker, color=color, markersize=8, label=meaning)
+        # Goals are framed, not filled.
+        if (marker, color) == ("s", GOAL):
+            handle.set_markerfacecolor("none")
+            handle.set_markeredgewidth(1.8)
+        handles.append(handle)
+    axes.legend(
+        handles=handles, loc="upper left", ncols=columns, frameon=False, fontsize=8, labelcolor=INK,
+        borderaxespad=0.1, handletextpad=0.1, columnspacing=0.9, handlelength=1.6,
+    )  # fmt: skip
+
+
+def _number(axes: Axes, rows: range, columns: range, gap: float = 0.62) -> None:
     """The numbers by which state names tell cells, outside the grid's first row and column."""
     for row in rows:
-        axes.text(columns[0] - 0.62, row, str(row), color=MUTED, fontsize=7, ha="right", va="center")
+        axes.text(columns[0] - gap, row, str(row), color=MUTED, fontsize=7, ha="right", va="center")
     for column in columns:
-        axes.text(column, rows[0] - 0.62, str(column), color=MUTED, fontsize=7, ha="center", va="bottom")
+        axes.text(column, rows[0] - gap, str(column), color=MUTED, fontsize=7, ha="center", va="bottom")
 
 
 def text_scene(mdp: TabularMDP) -> Scene:
@@ -112,31 +141,67 @@ def text_scene(mdp: TabularMDP) -> Scene:
 
 def patrol_scene(patrol: Patrol) -> Scene:
     """The floor with a patroller that points where it heads; instance 1 marks the hallway end it seeks."""
-    (low, left), (high, right) = np.min(patrol.cells, axis=0), np.max(patrol.cells, axis=0)
-    pixels = max(24, min(44, 480 / (high - low + 1)))
-    axes = _canvas(left - 1.1, right + 1, high + 1, low - 1.1, pixels, caption=48 / pixels)
-    for row, column in patrol.cells:
-        _cell(axes, row, column, FLOOR)
-    _number(axes, range(low, high + 1), range(left, right + 1))
-    body = Polygon(np.zeros((4, 2)), facecolor=AGENT, edgecolor=INK, linewidth=1.0, zorder=4)
-    sought = Rectangle((0, 0), 0.86, 0.86, facecolor="none", edgecolor=GOAL, linewidth=2.2, zorder=3)
-    axes.add_patch(body)
-    axes.add_patch(sought)
-    arrowhead = np.array([(0.42, 0.0), (-0.32, 0.3), (-0.16, 0.0), (-0.32, -0.3)])
     ends = _hallway_ends(patrol)
+    marks = [(">", AGENT, "patroller"), *([("s", GOAL, "end it seeks")] if ends else [])]
+    axes, columns = draw_floor(patrol.cells, marks)
+    body = Walker(axes, AGENT)
+    sought = outline(axes)
 
     def place(state: int) -> None:
         here = patrol.states[state]
-        angle = here.heading * np.pi / 2
-        # Rows grow downward: a turn to the left is one against the clock all the same.
-        turn = np.array([[np.cos(angle), -np.sin(angle)], [-np.sin(angle), -np.cos(angle)]])
-        body.set_xy(arrowhead @ turn + (here.column, here.row))
+        body.stand(here)
         sought.set_visible(here.phase in ends)
         if here.phase in ends:
             row, column = ends[here.phase]
             sought.set_xy((column - 0.43, row - 0.43))
 
-    return Scene(axes, patrol.mdp, (sought, body), place, int((right - left + 2) * pixels / 6.2))
+    return Scene(axes, patrol.mdp, (sought, body.artist), place, columns)
+
+
+def draw_floor(
+    cells: Sequence[tuple[int, int]], marks: Sequence[tuple[str, str, str]], lines: int = 1
+) -> tuple[Axes, int]:
+    """Axes with floor where the cells are and wall elsewhere, a key, and how many characters fit in a line.
+
+    ``marks`` are the key's, in so many ``lines``.
+    """
+    (low, left), (high, right) = np.min(cells, axis=0), np.max(cells, axis=0)
+    pixels = max(24, min(44, 480 / (high - low + 1)))
+    axes = _canvas(
+        left - 1.6, right + 1.1, high + 1.1, low - 1.5 - 18 * lines / pixels, pixels, caption=48 / pixels
+    )
+    size = (right - left + 1.7, high - low + 1.7)
+    axes.add_patch(Rectangle((left - 0.85, low - 0.85), *size, facecolor=WALL))
+    for row, column in cells:
+        _cell(axes, row, column, FLOOR)
+    _number(axes, range(low, high + 1), range(left, right + 1), gap=0.95)
+    _key(axes, marks, -(-len(marks) // lines))
+    return axes, int((right - left + 2.4) * pixels / 6.2)
+
+
+def outline(axes: Axes) -> Rectangle:
+    """The frame of a cell that is sought; its lower corner is for the caller to set."""
+    frame = Rectangle((0, 0), 0.86, 0.86, facecolor="none", edgecolor=GOAL, linewidth=2.2, zorder=3)
+    axes.add_patch(frame)
+    return frame
+
+
+class Walker:
+    """An arrowhead on a floor that points where somebody heads."""
+
+    def __init__(self, axes: Axes, color: str):
+        self.artist = Polygon(np.zeros((4, 2)), facecolor=color, edgecolor=INK, linewidth=1.0, zorder=4)
+        axes.add_patch(self.artist)
+
+    def stand(self, here: State) -> None:
+        """Put it in a cell, pointing along the heading."""
+        angle = here.heading * np.pi / 2
+        # Rows grow downward: a turn to the left is one against the clock all the same.
+        turn = np.array([[np.cos(angle), -np.sin(angle)], [-np.sin(angle), -np.cos(angle)]])
+        self.artist.set_xy(_ARROWHEAD @ turn + (here.column, here.row))
+
+
+_ARROWHEAD = np.array([(0.42, 0.0), (-0.32, 0.3), (-0.16, 0.0), (-0.32, -0.3)])
 
 
 def _hallway_ends(patrol: Patrol) -> dict[int, tuple[int, int]]:
@@ -180,6 +245,7 @@ def labyrinth_scene(labyrinth: Labyrinth) -> Scene:
         x, y = zip(places[node], places[parent_of(node)], strict=True)
         axes.plot(x, y, color=FLOOR, linewidth=11, solid_capstyle="projecting", zorder=1)
     axes.text(1.2, -16.2, "home", color=FLOOR, fontsize=10, va="center")
+    axes.text(places[WATER_PORT, 0], -16.2, "water", color=FLOOR, fontsize=10, ha="center", va="center")
     axes.add_patch(Polygon(_DROP + places[WATER_PORT], facecolor=WATER, zorder=2))
     turns = np.array([[np.cos(t), np.sin(t)] for t in np.linspace(0, 2 * np.pi, 24)])
     shapes = [
@@ -234,7 +300,11 @@ def object_world_scene(world: ObjectWorld) -> Scene:
     """The grid with its walls, the two objects as stars, and the agent."""
     rows, columns = world.walls.shape
     pixels = max(16, 420 / max(rows, columns))
-    axes = _canvas(-1.3, columns, rows, -1.3, pixels, caption=48 / pixels)
+    axes = _canvas(-1.3, columns, rows, -1.3 - 18 / pixels, pixels, caption=48 / pixels)
+    _key(
+        axes,
+        [("o", AGENT, "agent"), ("*", GOAL, "first object"), ("*", WATER, "second"), ("s", WALL, "wall")],
+    )
     for row in range(rows):
         for column in range(columns):
             _cell(axes, row, column, WALL if world.walls[row, column] else FLOOR)
