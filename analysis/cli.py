@@ -198,22 +198,22 @@ def run_methods(
 @run.command("label-bias")
 def run_label_bias(
     worlds: Annotated[int, typer.Option(min=1, help="Object Worlds drawn.")] = 100,
-    trajectories: Annotated[int, typer.Option(min=3, help="Expert trajectories a world.")] = 75,
+    trajectories: Annotated[int, typer.Option(min=4, help="Expert trajectories a world.")] = 75,
     walls: Annotated[int, typer.Option(min=0, help="Walls a world, of 100 cells.")] = 25,
     seed: Seed = 0,
     report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-label-bias"),
     as_json: Json = False,
 ) -> None:
     """Does a likelier trajectory earn more? Table 5.1, in many Object Worlds and under many assumptions."""
-    from . import label_bias
+    from . import label_bias, label_bias_report
 
     with _reported_errors(), _progress(as_json) as advance:
         study = label_bias.study(worlds, trajectories, walls=walls, seed=seed, advance=advance)
-        label_bias.write(study, report)
+        label_bias_report.write(study, report)
     if as_json:
-        print(json.dumps(label_bias.summary(study)))
+        print(json.dumps(label_bias_report.summary(study)))
     else:
-        label_bias.print_tables(study, _console())
+        label_bias_report.print_tables(study, _console())
         print(f"Report: {report / 'index.html'}")
 
 

@@ -8,12 +8,10 @@ normalised over the actions of its own state: that is where the number of choice
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -23,14 +21,10 @@ from jaxtyping import Array, Float, Int
 from scipy import stats
 
 from ..domains.object_world import ObjectWorld, object_world, without_blocked_moves
+from ..domains.sorting_line import Share, wilson
 from ..inference.boltzmann import boltzmann_log_policy, optimal_action_values
 from ..models.mdp import Labels, TabularMDP
 from ..models.planning import finite_soft_plan, greedy_actions, reward_of
-from .report import Picture, Section, Table, write_report
-from .style import save_themes
-
-if TYPE_CHECKING:
-    from rich.console import Console
 
 Advance = Callable[[str, float | None], None]
 # What the dissertation prints for Bayesian IRL.
@@ -121,13 +115,23 @@ class SettingResult(NamedTuple):
     choice: Float[np.ndarray, " worlds"]
 
     @property
-    def significant(self) -> float:
+    def significant(self) -> Share:
         """Share of the worlds with a correlation in which BIRL's is significant at 0.05."""
-        return float(np.mean(self.p[np.isfinite(self.p)] < LEVEL))
+        return _share(self.p < LEVEL, self.p)
+
+    @property
+    def negative(self) -> Share:
+        """Share of the worlds with a correlation in which BIRL's is significant and negative."""
+        return _share((self.p < LEVEL) & (self.birl < 0), self.p)
+
+
+def _share(which: np.ndarray, p: np.ndarray) -> Share:
+    known = np.isfinite(p)
+    return wilson(float(np.sum(which & known)), float(np.sum(known)))
 
 
 class LabelBiasStudy(NamedTuple):
-    """Settings and results; ``sweep`` holds BIRL's correlation ``[etas, worlds]`` for both kinds of walls.
+    """Settings and results; ``sweep`` holds a result for each of ``etas``, for both kinds of walls.
 
     ``world``, ``trajectories`` and the two correlations are those of the world whose BIRL correlation in the
     first setting is the median over worlds (the lower one of two).
@@ -139,7 +143,7 @@ class LabelBiasStudy(NamedTuple):
     seed: int
     results: tuple[SettingResult, ...]
     etas: tuple[float, ...]
-    sweep: dict[bool, Float[np.ndarray, "etas worlds"]]
+    sweep: dict[bool, tuple[SettingResult, ...]]
     world: ObjectWorld
     trajectories: Trajectories
     birl: Correlation
@@ -158,12 +162,13 @@ def study(
 ) -> LabelBiasStudy:
     """Correlate log-likelihood and total reward of expert trajectories, in many worlds and settings.
 
-    The first of ``settings`` is the one that is shown. Raises ``ValueError`` for no world, fewer than three
-    trajectories, no setting, and where no world of the first setting has a correlation.
+    The first of ``settings`` is the one that is shown. Raises ``ValueError`` for no world, fewer than four
+    trajectories (their correlation has no interval), no setting, and where no world of the first setting has
+    a correlation.
     """
-    if worlds < 1 or trajectories < 3 or not settings:
+    if worlds < 1 or trajectories < 4 or not settings:
         raise ValueError(
-            "the study needs at least 1 world, 3 trajectories a world and 1 setting, "
+            "the study needs at least 1 world, 4 trajectories a world and 1 setting, "
             f"got {worlds}, {trajectories} and {len(settings)}"
         )
     layout, walk = jax.random.split(jax.random.key(seed))
@@ -192,8 +197,8 @@ def study(
             walked = _in_every_world(
                 keys, mdps, weights, eta, DISCOUNT, _expert_code(BOLTZMANN), steps=STEPS, n=trajectories
             )
-            rows.append(_result(Setting(eta=eta, blocked=blocked), walked).birl)
-        sweep[blocked] = np.array(rows)
+            rows.append(_result(Setting(eta=eta, blocked=blocked), walked))
+        sweep[blocked] = tuple(rows)
     shown = _median_world(results[0].birl)
     of_world: Trajectories = jax.tree.map(lambda x: x[shown], first)
     advance("done", 1.0)
@@ -350,155 +355,15 @@ def _walk(
     return lax.scan(step, state, (jax.random.split(key, len(policies)), policies))[1]
 
 
-# -- telling ------------------------------------------------------------------------------------------
+def quantiles(rho: Float[np.ndarray, " worlds"]) -> tuple[float, float, float]:
+    """The 5 %, 50 % and 95 % quantiles over the worlds with a correlation; NaN if there is none."""
+    known = rho[np.isfinite(rho)]
+    low, median, high = np.quantile(known, (0.05, 0.5, 0.95)) if len(known) else [np.nan] * 3
+    return float(low), float(median), float(high)
 
 
-def _rows(study: LabelBiasStudy) -> list[dict[str, Any]]:
-    rows = []
-    for result in study.results:
-        known = np.isfinite(result.birl)
-        low, median, high = (
-            np.quantile(result.birl[known], (0.05, 0.5, 0.95)) if known.any() else [np.nan] * 3
-        )
-        rows.append({
-            "setting": result.setting.name,
-            "worlds with a correlation": int(known.sum()),
-            "BIRL median rho": float(median),
-            "BIRL rho, 5 % and 95 % of worlds": [float(low), float(high)],
-            "share significant": result.significant,
-            "share significantly negative": float(np.mean(((result.p < LEVEL) & (result.birl < 0))[known])),
-            "median rho of choices met": float(np.nanmedian(result.choice)),
-            "MaxEnt largest |1 - rho|": float(np.nanmax(np.abs(1 - result.maxent))),
-        })  # fmt: skip
-    return rows
-
-
-def summary(study: LabelBiasStudy) -> dict[str, Any]:
-    """Settings and results as plain data."""
-    return {
-        "worlds": study.worlds,
-        "trajectories": study.per_world,
-        "walls": study.walls,
-        "seed": study.seed,
-        "median world": {"BIRL": study.birl._asdict(), "MaxEnt": study.maxent._asdict()},
-        "settings": _rows(study),
-        "sweep": {
-            "eta": list(study.etas),
-            "median rho, blocked moves stay": _medians(study.sweep[True]),
-            "median rho, only open moves": _medians(study.sweep[False]),
-        },
-        "dissertation": {
-            "rho": PRINTED_RHO,
-            "p": PRINTED_P,
-            "p of that rho for 75 trajectories": significance(PRINTED_RHO, 75),
-        },
-    }
-
-
-def _medians(rho: Float[np.ndarray, "etas worlds"]) -> list[float]:
-    return [float(np.nanmedian(row)) for row in rho]
-
-
-def _tables(study: LabelBiasStudy) -> tuple[Table, ...]:
-    def told(c: Correlation) -> tuple[str, ...]:
-        return f"{c.rho:.4f}", f"{c.low:.2f} to {c.high:.2f}", f"{c.p:.4f}", f"{c.n}"
-
-    table = Table(
-        ("", "rho", "95 % interval", "p", "n"),
-        [
-            ("BIRL", *told(study.birl)),
-            ("MaxEnt", *told(study.maxent)),
-            ("dissertation, BIRL", f"{PRINTED_RHO}", "", f"{PRINTED_P}", "75"),
-            ("dissertation, MaxEnt", "1.0", "", "0.0", "75"),
-        ],
-        f"Log-likelihood and total reward in the median world of {study.results[0].setting.name}. "
-        f"A correlation of {PRINTED_RHO} of 75 pairs has p = {significance(PRINTED_RHO, 75):.3f}; the p "
-        f"printed would go with some 37 pairs (p = {significance(PRINTED_RHO, 37):.3f}).",
-    )
-    settings = [
-        (
-            row["setting"],
-            f"{row['BIRL median rho']:+.2f} "
-            f"({row['BIRL rho, 5 % and 95 % of worlds'][0]:+.2f} to "
-            f"{row['BIRL rho, 5 % and 95 % of worlds'][1]:+.2f})",
-            f"{100 * row['share significant']:.0f} %",
-            f"{100 * row['share significantly negative']:.0f} %",
-            f"{row['median rho of choices met']:+.2f}",
-            f"{row['MaxEnt largest |1 - rho|']:.0e}",
-        )
-        for row in _rows(study)
-    ]
-    return table, Table(
-        (
-            "setting",
-            "BIRL, rho: median (90 % of worlds)",
-            "p < 0.05",
-            "of these negative",
-            "choices met",
-            "MaxEnt, |1 - rho|",
-        ),
-        settings,
-        f"{study.worlds} worlds, {study.per_world} trajectories each. Choices met: median correlation of the "
-        "total reward and the nats BIRL takes off for choices; MaxEnt: the largest deviation in any world.",
-    )
-
-
-def _text(study: LabelBiasStudy) -> str:
-    first = study.results[0]
-    share = 100 * first.significant
-    return f"""A world of 10 x 10 cells with {study.walls} walls, a desirable object in each of two corners, \
-deterministic moves. The law of maximum entropy makes a trajectory's log-likelihood its reward less a \
-constant, so the two correlate perfectly, whoever demonstrates.
-
-Bayesian IRL normalises over actions in every state. Its log-likelihood is the sum of advantages times eta, \
-which grows with the reward, less what the choices met on the way cost, and at an object in a corner there \
-are most equally good choices: moving against either edge is one more way of staying. The two pull in \
-opposite directions, and what comes out depends on how sharply experts choose.
-
-With exp(Q) as the dissertation writes it (eta 1), a discount of {DISCOUNT:g}, {first.setting.steps} steps \
-and experts that follow that law, the correlation is small: significant at 0.05 in {share:.0f} % of the \
-worlds, where chance alone would give 5 %. It is not so everywhere. Better experts (a larger eta, or optimal \
-ones) make it strongly negative: the more a trajectory earns, the less likely BIRL finds it. Longer \
-trajectories, a shorter sight, or a world where moves against walls are no actions make it positive. The \
-dissertation says of none of these which it used, so its number is one point of the curve below and not a \
-property of the method; that it can be anything is."""
-
-
-def print_tables(study: LabelBiasStudy, console: Console) -> None:
-    """Print Table 5.1 as reproduced, and what other settings give."""
-    from rich.table import Table as RichTable
-
-    for part in _tables(study):
-        table = RichTable(caption=part.caption, caption_justify="left")
-        for i, heading in enumerate(part.headings):
-            table.add_column(heading, justify="left" if i == 0 else "right")
-        for row in part.rows:
-            table.add_row(*map(str, row))
-        console.print(table)
-
-
-def write(study: LabelBiasStudy, folder: Path | str) -> Path:
-    """Write the report: ``index.html``, the pictures in both themes, and ``results.json``."""
-    from . import label_bias_figures as figures
-
-    folder = Path(folder)
-    pictures = [
-        Picture(*save_themes(partial(draw, study), folder, name), caption, description)
-        for name, draw, caption, description in (
-            ("world", figures.draw_world,
-             "The median world: walls, the two objects, and trajectories from the least reward to the most.",
-             "Grid with walls, two objects in opposite corners, and five paths"),
-            ("scatter", figures.draw_scatter,
-             "Log-likelihood against total reward of the median world's trajectories.",
-             "Two scatter plots: no clear relation for BIRL, a straight line for MaxEnt"),
-            ("settings", figures.draw_settings,
-             "Correlation in every world, setting by setting.",
-             "Correlations of BIRL from minus one to one depending on the setting; of MaxEnt always one"),
-            ("sweep", figures.draw_sweep,
-             "Correlation against how sharply experts choose (and are believed to choose).",
-             "BIRL's correlation falls from positive to minus one with eta where blocked moves stay"),
-        )
-    ]  # fmt: skip
-    (folder / "results.json").write_text(json.dumps(summary(study), indent=2) + "\n")
-    section = Section("Label bias (Table 5.1)", _text(study), _tables(study), pictures)
-    return write_report(folder, [section], title="Label bias")
+def tell_p(p: float) -> str:
+    """A p-value to four digits; a smaller one as the power of ten it is below."""
+    if p >= 1e-4:
+        return f"{p:.4f}"
+    return f"< 1e{int(np.ceil(np.log10(p)))}" if p > 1e-300 else "< 1e-300"

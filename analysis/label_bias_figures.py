@@ -30,10 +30,10 @@ def draw_world(study: LabelBiasStudy, theme: Theme) -> Figure:
     for r, c in np.argwhere(world.walls):
         axes.add_patch(Rectangle((c - 0.5, r - 0.5), 1, 1, facecolor=theme.muted, edgecolor=theme.surface))
     for r, c in world.objects:
-        axes.plot(c, r, marker="*", color=theme.goal, markersize=17, zorder=2)
+        axes.plot(c, r, marker="*", color=theme.ink, markersize=17, zorder=1)
     handles = [
         Patch(facecolor=theme.muted, label="wall"),
-        Line2D([], [], marker="*", color=theme.goal, markersize=12, linestyle="", label="object"),
+        Line2D([], [], marker="*", color=theme.ink, markersize=12, linestyle="", label="object"),
     ]
     cells = np.array(world.cells)
     ranked = np.argsort(np.asarray(study.trajectories.reward), kind="stable")
@@ -66,6 +66,8 @@ def draw_world(study: LabelBiasStudy, theme: Theme) -> Figure:
 
 def draw_scatter(study: LabelBiasStudy, theme: Theme) -> Figure:
     """Log-likelihood against total reward under both methods, side by side."""
+    from .label_bias import tell_p
+
     figure = new_figure(theme, 9.0, 3.9)
     reward = np.asarray(study.trajectories.reward)
     # Rewards are whole numbers: spread a little, so that trajectories on one spot can be counted.
@@ -84,7 +86,8 @@ def draw_scatter(study: LabelBiasStudy, theme: Theme) -> Figure:
             reward + (spread if name == "BIRL" else 0), np.asarray(likelihood), linestyle="", markersize=5,
             marker=style["marker"], color=style["color"], alpha=0.6,
         )  # fmt: skip
-        title = f"{name}: rho = {found.rho:.3f}, p = {found.p:.2g}"
+        p = tell_p(found.p)
+        title = f"{name}: rho = {found.rho:.3f}, p {p if p.startswith('<') else f'= {p}'}"
         dress(axes, theme, title=title, x="total reward (steps at an object)", y="log-likelihood (nats)")
     foot(
         figure,
@@ -104,6 +107,8 @@ def _critical(n: int) -> float:
 
 def draw_settings(study: LabelBiasStudy, theme: Theme) -> Figure:
     """Every world's correlation, one row a setting."""
+    from .label_bias import PRINTED_RHO
+
     figure = new_figure(theme, 9.0, 1.6 + 0.42 * len(study.results))
     axes = figure.subplots()
     limit = _critical(study.per_world)
@@ -114,11 +119,15 @@ def draw_settings(study: LabelBiasStudy, theme: Theme) -> Figure:
         known = result.birl[np.isfinite(result.birl)]
         height = i + scatter.uniform(-0.22, 0.22, len(known))
         axes.plot(known, height, linestyle="", marker="o", markersize=3.2, color=birl["color"], alpha=0.45)
-        axes.plot(np.median(known), i, marker="|", markersize=17, markeredgewidth=2.4, color=theme.ink)
+        if len(known):
+            axes.plot(np.median(known), i, marker="|", markersize=17, markeredgewidth=2.4, color=theme.ink)
         perfect = result.maxent[np.isfinite(result.maxent)]
         axes.plot(
             perfect, np.full(len(perfect), i), linestyle="", marker="^", markersize=7, color=maxent["color"]
         )
+    printed = axes.axvline(
+        PRINTED_RHO, color=theme.ink, linewidth=1.2, linestyle=(0, (1, 1.5)), label="dissertation, BIRL"
+    )
     dress(axes, theme, x="correlation of log-likelihood and total reward", grid="x")
     axes.set_yticks(range(len(study.results)), [r.setting.name for r in study.results], fontsize=SMALL)
     axes.set(ylim=(len(study.results) - 0.5, -0.5), xlim=(-1.05, 1.05))
@@ -128,14 +137,15 @@ def draw_settings(study: LabelBiasStudy, theme: Theme) -> Figure:
                label="BIRL, median"),
         Line2D([], [], linestyle="", marker="^", color=maxent["color"], label="MaxEnt, all worlds"),
         band,
+        printed,
     ]  # fmt: skip
-    head(figure, theme, handles, title="What the correlation depends on", columns=4)
+    head(figure, theme, handles, title="What the correlation depends on", columns=3)
     return figure
 
 
 def draw_sweep(study: LabelBiasStudy, theme: Theme) -> Figure:
     """BIRL's correlation against the inverse temperature of experts and of the likelihood alike."""
-    from .label_bias import PRINTED_RHO
+    from .label_bias import PRINTED_RHO, quantiles
 
     figure = new_figure(theme, 8.2, 4.4)
     axes = figure.subplots()
@@ -144,9 +154,9 @@ def draw_sweep(study: LabelBiasStudy, theme: Theme) -> Figure:
         axes.axhspan(-limit, limit, color=theme.view, zorder=0, label="not significant at 0.05")
     ]
     names = {True: "BIRL, blocked moves stay put", False: "BIRL, only open moves are actions"}
-    for i, (blocked, rho) in enumerate(study.sweep.items(), start=1):
+    for i, (blocked, results) in enumerate(study.sweep.items(), start=1):
         style = series_style(theme, i)
-        low, median, high = np.nanquantile(rho, (0.05, 0.5, 0.95), axis=1)
+        low, median, high = np.array([quantiles(result.birl) for result in results]).T
         axes.fill_between(study.etas, low, high, color=style["color"], alpha=0.2, linewidth=0)
         handles += axes.plot(study.etas, median, label=names[blocked], markersize=5, **style)
     handles.append(axes.axhline(1.0, color=series_style(theme, 0)["color"], linewidth=2, label="MaxEnt"))

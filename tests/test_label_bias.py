@@ -10,7 +10,7 @@ import pytest
 from scipy import stats
 from typer.testing import CliRunner
 
-from i2rl.analysis import label_bias
+from i2rl.analysis import label_bias, label_bias_report
 from i2rl.analysis.cli import app
 from i2rl.analysis.label_bias import BOLTZMANN, MAXENT, OPTIMAL, Setting
 from i2rl.domains.object_world import object_world, walled_world, without_blocked_moves
@@ -21,14 +21,23 @@ def _small_world():
     return walled_world(walls, ((0, 0), (1, 2)), weights=(1.0, 0.5, -0.1), discount=0.8)
 
 
+_STEPS, _ETA, _DRAWS = 3, 2.0, 20_000
+
+
+@cache
+def _drawn_in_the_small_world(expert, blocked):
+    world = _small_world() if blocked else without_blocked_moves(_small_world())
+    return label_bias.demonstrate_and_score(
+        jax.random.key(0), world.mdp, jnp.asarray(world.weights), _ETA, expert=expert, steps=_STEPS, n=_DRAWS
+    )
+
+
 @pytest.mark.parametrize("expert", [BOLTZMANN, OPTIMAL, MAXENT])
 @pytest.mark.parametrize("blocked", [True, False])
 def test_likelihoods_are_those_of_enumeration(expert, blocked):
     world = _small_world() if blocked else without_blocked_moves(_small_world())
-    mdp, steps, eta = world.mdp, 3, 2.0
-    drawn = label_bias.demonstrate_and_score(
-        jax.random.key(0), mdp, jnp.asarray(world.weights), eta, expert=expert, steps=steps, n=20
-    )
+    mdp, steps, eta = world.mdp, _STEPS, _ETA
+    drawn = _drawn_in_the_small_world(expert, blocked)
     reward = np.asarray(mdp.features) @ world.weights
     available, following = np.asarray(mdp.available), np.asarray(mdp.successors)[..., 0]
     value = np.zeros(mdp.n_states)
@@ -58,39 +67,41 @@ def test_likelihoods_are_those_of_enumeration(expert, blocked):
 
 
 def test_experts_draw_from_their_laws():
-    world = _small_world()
-    drawn = {
-        expert: label_bias.demonstrate_and_score(
-            jax.random.key(1), world.mdp, jnp.asarray(world.weights), 2.0, expert=expert, steps=2, n=20_000
-        )
-        for expert in (BOLTZMANN, MAXENT)
-    }
-    starts = len(world.cells)
-    for expert, log_law in (
-        (BOLTZMANN, np.asarray(drawn[BOLTZMANN].birl) - np.log(starts)),
-        (MAXENT, np.asarray(drawn[MAXENT].maxent)),
-    ):
-        paths = np.column_stack([drawn[expert].states[:, 0], drawn[expert].actions])
+    starts = len(_small_world().cells)
+    for expert in (BOLTZMANN, MAXENT):
+        drawn = _drawn_in_the_small_world(expert, True)
+        log_law = drawn.birl - np.log(starts) if expert == BOLTZMANN else drawn.maxent
+        paths = np.column_stack([drawn.states[:, 0], drawn.actions])
         _, where, counts = np.unique(paths, axis=0, return_index=True, return_counts=True)
-        chance = np.exp(log_law[where])
-        often = chance > 5 / 20_000
-        score = (counts - 20_000 * chance)[often] / np.sqrt(20_000 * chance * (1 - chance))[often]
+        chance = np.exp(np.asarray(log_law)[where])
+        often = chance > 5 / _DRAWS
+        assert chance[often].sum() > 0.9
+        score = (counts - _DRAWS * chance)[often] / np.sqrt(_DRAWS * chance * (1 - chance))[often]
         assert stats.chi2.sf((score**2).sum(), often.sum()) > 1e-4
 
 
+# As many worlds, trajectories and steps as the study below, so that they share its compiled program.
+_WORLDS, _TRAJECTORIES = 8, 75
+
+
+def _in_every_world(mdps, weights, expert):
+    stacked = label_bias._stacked(mdps)
+    return label_bias._in_every_world(
+        jax.random.split(jax.random.key(3), len(mdps)), stacked, jnp.asarray(weights), 1.0, 0.99,
+        label_bias.EXPERTS.index(expert), steps=Setting().steps, n=_TRAJECTORIES,
+    )  # fmt: skip
+
+
 def test_optimal_experts_earn_the_most_there_is():
-    world = object_world(jax.random.key(2), 6, 8)
-    drawn = label_bias.demonstrate_and_score(
-        jax.random.key(3), world.mdp, jnp.asarray(world.weights), 1.0, expert=OPTIMAL, steps=8, n=50
-    )
-    best = np.zeros(len(world.cells))
-    reward, following = (
-        np.asarray(world.mdp.features) @ world.weights,
-        np.asarray(world.mdp.successors)[..., 0],
-    )
-    for _ in range(8):
-        best = (reward + best[following]).max(1)
-    np.testing.assert_allclose(drawn.reward, best[np.asarray(drawn.states[:, 0])])
+    worlds = [object_world(jax.random.key(i)) for i in range(_WORLDS)]
+    drawn = _in_every_world([world.mdp for world in worlds], worlds[0].weights, OPTIMAL)
+    for i, world in enumerate(worlds):
+        best = np.zeros(len(world.cells))
+        reward = np.asarray(world.mdp.features) @ world.weights
+        following = np.asarray(world.mdp.successors)[..., 0]
+        for _ in range(Setting().steps):
+            best = (reward + best[following]).max(1)
+        np.testing.assert_allclose(drawn.reward[i], best[np.asarray(drawn.states[i, :, 0])])
 
 
 def test_correlation_is_pearsons():
@@ -107,7 +118,7 @@ def test_correlation_is_pearsons():
 @cache
 def _study():
     settings = (Setting(), Setting(OPTIMAL, eta=10.0), Setting(MAXENT, blocked=False))
-    return label_bias.study(8, seed=3, settings=settings, etas=(1.0, 10.0))
+    return label_bias.study(_WORLDS, _TRAJECTORIES, seed=3, settings=settings, etas=(1.0, 10.0))
 
 
 def test_maximum_entropy_has_no_label_bias():
@@ -122,7 +133,7 @@ def test_maximum_entropy_has_no_label_bias():
 def test_bayesian_irl_has():
     first, optimal, _ = _study().results
     assert _study().birl.p > 0.05
-    assert first.significant < 0.5
+    assert first.significant.value < 0.5
     # What the choices met on the way cost outweighs what better actions bring.
     assert (optimal.birl < -0.5).all()
     assert (optimal.choice > 0.5).all()
@@ -138,36 +149,73 @@ def test_the_world_shown_is_the_median_one():
 
 def test_the_same_seed_gives_the_same_numbers():
     few = {"settings": (Setting(),), "etas": (1.0,)}
-    one, again, other = (label_bias.study(2, 10, seed=s, **few) for s in (0, 0, 1))
+    one, again, other = (label_bias.study(_WORLDS, _TRAJECTORIES, seed=s, **few) for s in (0, 0, 1))
     assert (one.results[0].birl == again.results[0].birl).all()
     assert (one.results[0].birl != other.results[0].birl).any()
 
 
-@pytest.mark.parametrize("given", [(0, 75), (3, 2)])
+@pytest.mark.parametrize("given", [(0, 75), (3, 3)])
 def test_too_little_is_refused(given):
-    with pytest.raises(ValueError, match="at least 1 world, 3 trajectories"):
+    with pytest.raises(ValueError, match="at least 1 world, 4 trajectories"):
         label_bias.study(*given)
 
 
 def test_an_unknown_expert_is_refused():
     with pytest.raises(ValueError, match="expert must be"):
-        label_bias.study(1, 3, settings=(Setting("lucky"),), etas=())
+        label_bias.study(1, 4, settings=(Setting("lucky"),), etas=())
 
 
-def test_worlds_without_a_correlation_are_left_out():
-    # From every cell of a world of objects alone the optimal experts earn the same.
+def test_worlds_without_a_correlation_are_left_out(tmp_path):
     study = _study()
+    # Where nothing is a feature, every trajectory earns nothing.
     flat = replace(study.world.mdp, features=jnp.zeros_like(study.world.mdp.features))
-    stacked = jax.tree.map(lambda x: x[None], flat)
-    walked = label_bias._in_every_world(
-        jax.random.split(jax.random.key(0), 1), stacked, jnp.asarray(study.world.weights), 1.0, 0.99,
-        label_bias.EXPERTS.index(BOLTZMANN), steps=10, n=10,
-    )  # fmt: skip
-    assert np.isnan(label_bias._result(Setting(), walked).birl).all()
+    walked = _in_every_world([flat] * _WORLDS, study.world.weights, BOLTZMANN)
+    result = label_bias._result(Setting(), walked)
+    assert np.isnan(result.birl).all()
+    half = result._replace(
+        birl=np.append(result.birl[1:], -0.9),
+        p=np.append(result.p[1:], 1e-9),
+        maxent=np.append(result.p[1:], 1),
+    )
+    assert (half.significant.value, half.negative.value) == (1.0, 1.0)
+    # A report of nothing but such worlds is still one, and still JSON.
+    sweep = dict.fromkeys((True, False), (result, half))
+    told = label_bias_report.summary(study._replace(results=(half, result), sweep=sweep))
+    assert json.loads(json.dumps(told, allow_nan=False))["settings"][1]["BIRL median rho"] is None
+    label_bias_report.write(study._replace(results=(half, result), sweep=sweep), tmp_path)
+
+
+def test_the_report_says_where_the_correlation_is_significant():
+    study = _study()
+    n = study.per_world
+
+    def result(eta, *rho):
+        rho = np.array(rho)
+        p = np.array([label_bias.significance(r, n) for r in rho])
+        return label_bias.SettingResult(Setting(eta=eta), rho, p, np.ones_like(rho), rho)
+
+    told = label_bias_report._conditions(
+        study._replace(
+            results=(result(1.0, 0.1, -0.1), result(2.0, 0.5, 0.4)),
+            sweep={True: (result(3.0, -0.5, -0.4), result(4.0, 0.5, 0.1)), False: ()},
+        )
+    )
+    settings, etas = told.split("\n\n")
+    assert "half of the worlds in: Boltzmann experts, eta 1. It" in settings
+    assert "and positive in: Boltzmann experts, eta 2; negative in: in none." in settings
+    assert "half of the worlds in: 4. It" in etas
+    assert "and positive in: in none; negative in: 3." in etas
+
+
+@pytest.mark.parametrize(
+    ("p", "told"), [(0.39321, "0.3932"), (3e-5, "< 1e-4"), (1e-9, "< 1e-9"), (0.0, "< 1e-300")]
+)
+def test_small_p_values_are_told_by_their_power_of_ten(p, told):
+    assert label_bias.tell_p(p) == told
 
 
 def test_the_report_is_complete(tmp_path):
-    page = label_bias.write(_study(), tmp_path).read_text()
+    page = label_bias_report.write(_study(), tmp_path).read_text()
     assert "Label bias" in page
     for name in ("world", "scatter", "settings", "sweep"):
         for theme in ("light", "dark"):
@@ -180,8 +228,8 @@ def test_the_report_is_complete(tmp_path):
 def test_the_command_runs(tmp_path):
     result = CliRunner().invoke(
         app,
-        ["run", "label-bias", "--worlds", "2", "--trajectories", "10", "--report", str(tmp_path), "--json"],
+        ["run", "label-bias", "--worlds", str(_WORLDS), "--report", str(tmp_path), "--json"],
     )
     assert result.exit_code == 0, result.output
-    assert json.loads(result.stdout)["trajectories"] == 10
+    assert json.loads(result.stdout)["worlds"] == _WORLDS
     assert (tmp_path / "index.html").exists()
