@@ -202,7 +202,8 @@ def sort_belts(
         raise ValueError(f"at least one belt is needed, got {belts}")
     with np.errstate(divide="ignore"):
         log_policy = jnp.asarray(np.log(policy))
-    process = _tables(sorting)
+    # States, too, are padded with some that nothing leads to: all processes share that program.
+    log_policy, process = jax.tree.map(_states_padded, (log_policy, _tables(sorting)))
     speeds = jnp.array(line.seconds), jnp.array(float(line.set_seconds))
     chances = jnp.array([line.inspection, line.rolling, line.slip], float)
     # Padded to a power of two, so that many numbers of belts share a compiled program.
@@ -285,6 +286,11 @@ def _tables(sorting: Sorting) -> _Tables:
     start = [index[State(TABLE, UNKNOWN, hand, before)] for hand in range(4)]
     listed = sorting.factors[:, 3] == LISTED
     return _Tables(jnp.array(outcome), jnp.array(sorting.factors[:, 2]), jnp.array(listed), jnp.array(start))
+
+
+def _states_padded(table: Array) -> Array:
+    """A table ``[S, ...]`` with zeros up to the next multiple of 32 states."""
+    return jnp.pad(table, [(0, -len(table) % 32), *[(0, 0)] * (table.ndim - 1)])
 
 
 def _any_of(key: Array, mask: Bool[Array, " n"]) -> Int[Array, ""]:
