@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -177,28 +176,26 @@ not a property of the method. That the correlation can be anything is."""
 
 def _conditions(study: LabelBiasStudy) -> str:
     """Where BIRL's correlation is and is not significant in more than half of the worlds, in words."""
-
-    def listed(names: Sequence[str]) -> str:
-        return "; ".join(names) or "in none"
-
     told = []
     for title, results, name in (
-        ("Of the settings", study.results, lambda r: r.setting.name),
-        ("Of the values of eta, where blocked moves stay", study.sweep[True], _eta_of),
-        ("Of the values of eta, where only open moves are actions", study.sweep[False], _eta_of),
+        ("Of the settings, the correlation is", study.results, lambda r: r.setting.name),
+        ("Where blocked moves stay put, by eta, it is", study.sweep[True], _eta_of),
+        ("Where only open moves are actions, by eta, it is", study.sweep[False], _eta_of),
     ):
-        parts: dict[str, list[str]] = {"not significant": [], "positive": [], "negative": []}
+        parts: dict[str, list[str]] = {
+            "significant in at most half of the worlds": [],
+            "positive and significant in more than half": [],
+            "negative and significant in more than half": [],
+        }
+        rarely, positive, negative = parts.values()
         for result in results:
             rho = quantiles(result.birl)[1]
             if np.isfinite(rho):
-                kind = "positive" if rho > 0 else "negative"
-                parts[kind if result.significant.value > 0.5 else "not significant"].append(name(result))
-        if results:
-            told.append(
-                f"{title}, the correlation is significant in at most half of the worlds in: "
-                f"{listed(parts['not significant'])}. It is significant in more than half and positive in: "
-                f"{listed(parts['positive'])}; negative in: {listed(parts['negative'])}."
-            )
+                often = positive if rho > 0 else negative
+                (often if result.significant.value > 0.5 else rarely).append(name(result))
+        listed = [f"{kind}: {'; '.join(names)}" for kind, names in parts.items() if names]
+        if listed:
+            told.append(f"{title} {' | '.join(listed)}.")
     return "\n\n".join(told)
 
 

@@ -201,10 +201,10 @@ def test_the_report_says_where_the_correlation_is_significant():
         )
     )
     settings, etas = told.split("\n\n")
-    assert "half of the worlds in: Boltzmann experts, eta 1. It" in settings
-    assert "and positive in: Boltzmann experts, eta 2; negative in: in none." in settings
-    assert "half of the worlds in: 4. It" in etas
-    assert "and positive in: in none; negative in: 3." in etas
+    assert "significant in at most half of the worlds: Boltzmann experts, eta 1 |" in settings
+    assert settings.endswith("positive and significant in more than half: Boltzmann experts, eta 2.")
+    assert "significant in at most half of the worlds: 4 |" in etas
+    assert etas.endswith("negative and significant in more than half: 3.")
 
 
 @pytest.mark.parametrize(
