@@ -297,6 +297,9 @@ def dpm_birl(
     and accepts with ``min(1, P(X | theta') / P(X | theta))``; then moves every cluster's weights
     ``updates`` times. Starts from a random one of ``n`` labels for each trajectory.
 
+    The prior of a cluster's weights is uniform on the box, the default of the authors' code; the dissertation
+    writes a Gaussian base distribution, whose width it does not give.
+
     One deviation from the authors' code: it clips a proposed weight that leaves the box, which has no
     density to correct for and piles weights up on the boundary. Here the drift is clipped and the noise
     reflected, and the correction uses the density of exactly that, so the sampler's distribution is the
