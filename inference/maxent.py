@@ -229,6 +229,17 @@ def _expand(
     return _Expansion(expected - objective.features, weighted.T @ deviation, to_go, scale)
 
 
+def count_information(
+    mdp: TabularMDP, counts: Float[Array, "S A"], weights: Float[Array, " K"], values: Float[Array, " S"]
+) -> Float[Array, "K K"]:
+    """Information about the weights in visits ``counts [S, A]``: minus the Hessian of their log-likelihood.
+
+    At weights whose soft values are ``values [S]``. Positive semi-definite always; exact where the visits
+    flow as the soft policy's would.
+    """
+    return _expand(mdp, count_objective(mdp, counts), weights, values).hessian
+
+
 def _kkt_residual(
     slope: Float[Array, " K"], slack: Float[Array, " K"], weights: Float[Array, " K"]
 ) -> Float[Array, ""]:

@@ -23,15 +23,26 @@ from ..models.evidence import Imperfection, Sensor, require_possible
 from ..models.mdp import TabularMDP
 from ..models.planning import reachable_states, require_discounted
 from .clustering import Clustering
-from .jumble import Jumble, is_seen_whole, seen_in_part, seen_whole
+from .jumble import Jumble, explain_each, is_seen_whole, seen_in_part, seen_whole
 from .lme import _digest
-from .mixture_fit import Kept, Mixture, MixtureProgram, empty_mixture, log_policies, nothing_kept, search
+from .mixture_fit import (
+    Assigned,
+    Kept,
+    Mixture,
+    MixtureProgram,
+    assign,
+    empty_mixture,
+    log_policies,
+    nothing_kept,
+)
+from .mixture_search import search
 from .session import Learner
 
 DEFAULT_WAYS = 4
 DEFAULT_RESTARTS = 4
 # Experts are decided: a prior of scale 7 on each weight admits one who errs once in a thousand choices.
 DEFAULT_RIDGE = 0.02
+_FEWEST_ROWS = 32
 
 
 class MixtureState(NamedTuple):
@@ -137,8 +148,9 @@ def mme_mtirl(
         ``lambda`` of the entropic prior on the proportions, ``exp(-lambda H(pi))``: the min-entropy half of
         program (5.1). The dissertation's is 1.
     price : float
-        Share of the information of who did what that a further way must buy; see :mod:`.mixture_fit`. 1 is
-        the likelihood's own; less prefers several decided ways to one undecided.
+        What a nat of information of who did what costs, in nats of likelihood; see :mod:`.mixture_fit`. 1 is
+        the likelihood's own price, right for people who err; less prefers several decided ways to one
+        undecided.
     l1, ridge : float
         Rate of a Laplace and precision of a Gaussian prior on each weight (nats in all, not per trajectory).
     restarts : int
@@ -169,7 +181,7 @@ def mme_mtirl(
         return _session(program, restarts, state, jumble)
 
     compiled = jax.jit(run)
-    whole, in_part = (jax.jit(partial(f, mdp, sensor)) for f in (seen_whole, seen_in_part))
+    gather = _gathering(mdp, sensor)
 
     def session(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
         return run(state, seen_in_part(mdp, sensor, demonstration))
@@ -181,8 +193,7 @@ def mme_mtirl(
     def update(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
         began = time.perf_counter()
         rows = _rows(demonstration)
-        padded = demonstration.bucketed()
-        jumble = whole(padded) if is_seen_whole(sensor, demonstration) else in_part(padded)
+        jumble = gather(demonstration)
         new, report = compiled(state, jumble)
         if not np.isfinite(report.demonstration_log_likelihood):
             _explain_impossible(sensor, mdp, demonstration)
@@ -241,7 +252,7 @@ def batch_mme_mtirl(
     """
     sensor = Sensor() if sensor is None else sensor
     program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
-    whole, in_part = (jax.jit(partial(f, mdp, sensor)) for f in (seen_whole, seen_in_part))
+    gather = _gathering(mdp, sensor)
 
     @jax.jit
     def run(key: Array, jumble: Jumble) -> Any:
@@ -257,8 +268,7 @@ def batch_mme_mtirl(
                 "than that can be found",
                 stacklevel=2,
             )
-        padded = demonstration.bucketed()
-        found = run(key, whole(padded) if is_seen_whole(sensor, demonstration) else in_part(padded))
+        found = run(key, gather(demonstration))
         if not np.isfinite(found.objective):
             _explain_impossible(sensor, mdp, demonstration)
         proportions = np.asarray(found.mixture.proportions)
@@ -285,6 +295,33 @@ def clustering_of(state: MixtureState, report: MixtureReport) -> Clustering:
     )
 
 
+def assign_trajectories(
+    mdp: TabularMDP,
+    sensor: Imperfection | None,
+    weights: Float[np.ndarray, "D K"],
+    proportions: Float[np.ndarray, " D"],
+    demonstration: Demonstration,
+) -> Float[np.ndarray, "n D"]:
+    """Probability that each trajectory was done in each of these ways, hidden steps summed out.
+
+    By Bayes' rule alone (price 1), for any trajectories. Raises as :func:`mme_mtirl`'s ``update`` does.
+    """
+    sensor, rows = Sensor() if sensor is None else sensor, _rows(demonstration)
+    jumble = _gathering(mdp, sensor)(demonstration)
+    assigned = _assigned(mdp, jnp.asarray(weights, float), jnp.asarray(proportions, float), jumble)
+    if not np.isfinite(assigned.log_likelihood).all():
+        _explain_impossible(sensor, mdp, demonstration)
+    return np.asarray(assigned.responsibilities)[rows]
+
+
+@jax.jit
+def _assigned(
+    mdp: TabularMDP, weights: Float[Array, "D K"], proportions: Float[Array, " D"], jumble: Jumble
+) -> Assigned:
+    policies, _ = log_policies(mdp, weights, jnp.zeros((len(weights), mdp.n_states)))
+    return assign(explain_each(mdp, policies, jumble).log_likelihood, proportions, jumble.live, 1.0)
+
+
 # -- building blocks ----------------------------------------------------------------------------------
 
 
@@ -308,6 +345,19 @@ def _program(
             raise ValueError(f"{name} must not be negative, got {value}")
     reachable = jnp.asarray(reachable_states(mdp))
     return MixtureProgram(mdp, reachable, strength, l1, ridge, price, iterations, tolerance)
+
+
+def _gathering(mdp: TabularMDP, sensor: Imperfection) -> Callable[[Demonstration], Jumble]:
+    whole, in_part = (jax.jit(partial(f, mdp, sensor)) for f in (seen_whole, seen_in_part))
+
+    def gather(demonstration: Demonstration) -> Jumble:
+        padded = demonstration.bucketed()
+        if not is_seen_whole(sensor, demonstration):
+            return in_part(padded)
+        # Visits of a few trajectories more cost less than compiling for one shape more.
+        return whole(padded.padded(max(padded.n_trajectories, _FEWEST_ROWS), padded.kind.shape[1]))
+
+    return gather
 
 
 def _rows(demonstration: Demonstration) -> Int[np.ndarray, " n"]:
