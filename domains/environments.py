@@ -14,6 +14,10 @@ Those with a :class:`TabularMDP` are :class:`TabularEnv` and take ``weights``, t
 phi(s, a)`` (by default the domain's true ones). Their episodes never terminate; they are truncated after the
 steps given at registration (``max_episode_steps``). A breach is :class:`BreachEnv` and ends at a goal or when
 the learner is seen.
+
+Several at once: ``gymnasium.make_vec("i2rl.domains:i2rl/Patrol2-v0", ...)``. In processes of their own
+(``vectorization_mode="async"``) they need ``vector_kwargs={"context": "spawn"}``, since JAX does not survive a
+fork.
 """
 
 from __future__ import annotations
