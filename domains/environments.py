@@ -16,8 +16,8 @@ steps given at registration (``max_episode_steps``). A breach is :class:`BreachE
 the learner is seen.
 
 Several at once: ``gymnasium.make_vec("i2rl.domains:i2rl/Patrol2-v0", ...)``. In processes of their own
-(``vectorization_mode="async"``) they need ``vector_kwargs={"context": "spawn"}``, since JAX does not survive a
-fork.
+(``vectorization_mode="async"``) they need ``vector_kwargs={"context": "spawn"}``, since JAX does not survive
+a fork.
 """
 
 from __future__ import annotations
