@@ -258,8 +258,12 @@ def _median_world(rho: Float[np.ndarray, " worlds"]) -> int:
 
 
 def _stacked(mdps: Sequence[TabularMDP]) -> TabularMDP:
-    bare = [replace(m, labels=Labels(), inflow_pairs=None, inflow_probabilities=None) for m in mdps]
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *bare)
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *map(_bare, mdps))
+
+
+def _bare(mdp: TabularMDP) -> TabularMDP:
+    """Without what differs in kind from world to world and is not used here: one program serves them all."""
+    return replace(mdp, labels=Labels(), inflow_pairs=None, inflow_probabilities=None)
 
 
 @partial(jax.jit, static_argnames=("steps", "n"))
@@ -297,7 +301,7 @@ def demonstrate_and_score(
     Boltzmann and optimal experts begin in a cell drawn from the initial distribution; where those of maximum
     entropy begin is part of their law. Raises ``ValueError`` for another expert.
     """
-    return _drawn_and_scored(key, mdp, weights, eta, _expert_code(expert), steps, n)
+    return _drawn_and_scored(key, _bare(mdp), weights, eta, _expert_code(expert), steps, n)
 
 
 def _expert_code(expert: str) -> int:
