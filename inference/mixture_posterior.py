@@ -177,8 +177,9 @@ def sample_mixture_posterior(
         ``posterior``: ``weights (chain, draw, component, feature)``, ``proportions (chain, draw,
         component)``, and ``concentration (chain, draw)`` if it is random.
         ``assignments``: ``assignment (chain, draw, trajectory)``, the component of each trajectory in that
-        draw; ``n_ways (chain, draw)``, the number of components that have any; ``log_joint (chain, draw)``,
-        see :class:`Resolved`; ``co_clustering (trajectory, trajectory_)``, the posterior probability that two
+        draw; ``n_ways (chain, draw)``, the number of components that have any, and its posterior
+        ``n_ways_probability (ways)``, 1 to the number of trajectories; ``log_joint (chain, draw)``, see
+        :class:`Resolved`; ``co_clustering (trajectory, trajectory_)``, the posterior probability that two
         trajectories were done the same way.
         ``log_likelihood``: ``demonstration (chain, draw, trajectory)``, assignments summed out.
         ``sample_stats``: as in :func:`sample_posterior`.

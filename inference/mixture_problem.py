@@ -293,9 +293,10 @@ def mixture_data(
             "assignment": (tuple(grid), assignment.reshape(chains, draws, n)),
             "n_ways": (("chain", "draw"), occupied.reshape(chains, draws)),
             "log_joint": (("chain", "draw"), np.asarray(resolved.log_joint).reshape(chains, draws)),
+            "n_ways_probability": ("ways", np.bincount(occupied, minlength=n + 1)[1:] / len(assignment)),
             "co_clustering": (("trajectory", "trajectory_"), shared / len(assignment)),
         },
-        coords=grid | {"trajectory_": grid["trajectory"].values},
+        coords=grid | {"trajectory_": grid["trajectory"].values, "ways": np.arange(1, n + 1)},
         attrs=attrs,
     )
     idata.add_groups({"assignments": group})

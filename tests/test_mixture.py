@@ -18,14 +18,15 @@ from i2rl.models import (
     TrajectoryLaw,
     Visibility,
     require_possible,
-    reward_of,
-    soft_plan,
 )
 from i2rl.models.evidence import log_evidence
 from i2rl.models.mixture import (
     MixtureLaw,
+    as_evidence,
+    component_log_likelihoods,
     mixture_model,
     perceive,
+    soft_policies,
     stick_proportions,
     truncation_error,
 )
@@ -47,10 +48,19 @@ def sensor():
 
 
 @pytest.fixture(scope="module")
+def policies(mdp):
+    return jax.jit(soft_policies)(mdp, WEIGHTS)
+
+
+@partial(jax.jit, static_argnames="n")
+def simulated(key, mdp, sensor, n):
+    return TrajectoryLaw(mdp, WEIGHTS[0], sensor, 4).sample(key, (n,))
+
+
+@pytest.fixture(scope="module")
 def demonstration(mdp, sensor):
     """Simulated, wholly seen rows among them, with lost frames, a short trajectory and a repeated one."""
-    law = TrajectoryLaw(mdp, WEIGHTS[0], sensor, 4)
-    codes = np.array(law.sample(jax.random.key(1), (7,)))
+    codes = np.array(simulated(jax.random.key(1), mdp, sensor, 7))
     codes[0, 1] = [3, -1, -1]
     codes[1, 2:] = [0, -1, -1]
     codes[2] = codes[3]
@@ -71,29 +81,28 @@ def density(mdp, sensor, codes, values=None, **options):
 
 
 def test_density_is_a_sum_over_every_assignment_and_every_completion(
-    mdp, sensor, demonstration, enumerate_completions
+    mdp, sensor, demonstration, policies, enumerate_completions
 ):
-    few = demonstration.select([0, 1, 4])
-    evidence = np.asarray(log_evidence(sensor, mdp, few))
+    evidence = np.asarray(log_evidence(sensor, mdp, demonstration))
     table = np.array([
         [
-            enumerate_completions(
-                mdp, soft_plan(mdp, reward_of(mdp, w)).log_policy, e[:steps]
-            ).log_likelihood
-            for e, steps in zip(evidence, few.lengths, strict=True)
+            enumerate_completions(mdp, log_policy, e[:steps]).log_likelihood
+            for e, steps in zip(evidence, demonstration.lengths, strict=True)
         ]
-        for w in WEIGHTS
+        for log_policy in np.asarray(policies)
     ])  # fmt: skip
     proportions = [0.5, 0.5 * 0.25, 0.5 * 0.75]
     total = sum(
         np.prod([proportions[d] * np.exp(table[d, i]) for i, d in enumerate(ways)])
-        for ways in itertools.product(range(3), repeat=3)
+        for ways in itertools.product(range(3), repeat=7)
     )
     alpha = 1.7
     prior = np.sum(np.log(alpha) + (alpha - 1) * np.log(1 - np.asarray(STICKS)))
     prior += dist.Normal(0, PRIOR_SCALE).log_prob(WEIGHTS).sum()
     expected = float(prior + np.log(total))
-    assert density(mdp, sensor, few.codes, concentration=alpha) == pytest.approx(expected, rel=1e-10)
+    assert density(mdp, sensor, demonstration.codes, concentration=alpha) == pytest.approx(
+        expected, rel=1e-10
+    )
 
 
 def test_prepared_trajectories_give_the_same_density_and_gradient(mdp, sensor, demonstration):
@@ -106,29 +115,32 @@ def test_prepared_trajectories_give_the_same_density_and_gradient(mdp, sensor, d
     def f(weights, codes):
         return log_joint({"sticks": STICKS, "weights": weights}, mdp, sensor, codes)
 
-    both = jax.jit(jax.value_and_grad(f))
-    direct, prepared = both(WEIGHTS, demonstration.codes), both(WEIGHTS, perceived)
-    np.testing.assert_allclose(prepared[0], direct[0], rtol=1e-12)
-    np.testing.assert_allclose(prepared[1], direct[1], rtol=1e-9)
-    h = 1e-5
-    step = h * jnp.zeros_like(WEIGHTS).at[1, 0].set(1.0)
-    slope = (f(WEIGHTS + step, perceived) - f(WEIGHTS - step, perceived)) / (2 * h)
-    np.testing.assert_allclose(prepared[1][1, 0], slope, rtol=1e-6)
+    codes, h = demonstration.codes, 1e-5
+    value, gradient = jax.jit(jax.value_and_grad(f))(WEIGHTS, perceived)
+    np.testing.assert_allclose(value, f(WEIGHTS, codes), rtol=1e-12)
+    for d, k in np.ndindex(*WEIGHTS.shape):
+        step = jnp.zeros_like(WEIGHTS).at[d, k].set(h)
+        slope = float(f(WEIGHTS + step, codes) - f(WEIGHTS - step, codes)) / (2 * h)
+        assert float(gradient[d, k]) == pytest.approx(slope, rel=1e-6, abs=1e-7)
 
 
-def test_trajectories_all_seen_or_all_hidden_are_prepared_too(mdp, demonstration):
+def test_trajectories_all_seen_or_all_hidden_are_prepared_too(mdp, policies):
+    likelihoods = jax.jit(component_log_likelihoods)
     for sensor, codes in (
-        (Sensor(), np.array(TrajectoryLaw(mdp, WEIGHTS[0], Sensor(), 4).sample(jax.random.key(2), (3,)))),
-        (Visibility(np.zeros(3)), np.tile(np.array([2, -1, -1], np.int32), (3, 4, 1))),
+        (Sensor(), np.array(simulated(jax.random.key(2), mdp, Sensor(), 3))),
+        (Visibility(np.array([0.2, 0.9, 0.5])), np.tile(np.array([2, -1, -1], np.int32), (3, 4, 1))),
     ):
-        perceived, _ = perceive(mdp, sensor, codes)
+        perceived, rows = perceive(mdp, sensor, codes)
         assert len(perceived.counts) * len(perceived.live) == 0
-        assert density(mdp, sensor, perceived) == pytest.approx(density(mdp, sensor, codes), rel=1e-12)
+        prepared = likelihoods(mdp, policies, perceived)[:, rows]
+        direct = likelihoods(mdp, policies, as_evidence(mdp, sensor, codes))
+        np.testing.assert_allclose(prepared, direct, rtol=1e-12)
 
 
 def test_one_component_is_the_model_of_one_way(mdp, sensor, demonstration):
     values = {"weights": WEIGHTS[:1]}
-    alone = log_density(occlusion_model, (mdp, sensor, demonstration.codes), {}, {"weights": WEIGHTS[0]})[0]
+    arguments = mdp, sensor, demonstration.codes
+    alone = jax.jit(lambda w: log_density(occlusion_model, arguments, {}, {"weights": w})[0])(WEIGHTS[0])
     mixed = density(mdp, sensor, demonstration.codes, values, components=1)
     assert mixed == pytest.approx(float(alone), rel=1e-12)
 
@@ -150,9 +162,9 @@ def test_truncation_error_bounds_the_exact_expression():
 
 def test_two_trajectories_share_a_way_with_the_probability_of_the_process(mdp, sensor):
     alpha, draws = 0.6, 4000
-    drawn = Predictive(mixture_model, num_samples=draws, condition_deterministic=True, parallel=False)(
-        jax.random.key(0), mdp, sensor, components=12, concentration=alpha, n_trajectories=2, length=1
-    )
+    predictive = Predictive(mixture_model, num_samples=draws, condition_deterministic=True, parallel=False)
+    options = {"components": 12, "concentration": alpha, "n_trajectories": 2, "length": 1}
+    drawn = jax.jit(partial(predictive, **options))(jax.random.key(0), mdp, sensor)
     assert set(drawn) == {"sticks", "proportions", "weights", "assignment", "demonstration"}
     shared = np.asarray(drawn["assignment"][:, 0] == drawn["assignment"][:, 1])
     expected = 1 / (1 + alpha)
@@ -162,16 +174,15 @@ def test_two_trajectories_share_a_way_with_the_probability_of_the_process(mdp, s
 
 def test_a_simulated_trajectory_is_done_in_its_own_way(mdp):
     strong = jnp.array([[30.0, 0.0], [-30.0, 0.0]])
-    sticks, n = jnp.array([0.4]), 400
-    drawn = Predictive(
-        mixture_model, {"sticks": jnp.tile(sticks, (2, 1)), "weights": jnp.tile(strong, (2, 1, 1))}
-    )(jax.random.key(0), mdp, Sensor(), components=2, n_trajectories=n, length=3)
+    sticks, n = jnp.array([0.4]), 800
+    predictive = Predictive(mixture_model, {"sticks": sticks[None], "weights": strong[None]})
+    options = {"components": 2, "n_trajectories": n, "length": 3}
+    drawn = jax.jit(partial(predictive, **options))(jax.random.key(0), mdp, Sensor())
     require_possible(Sensor(), mdp, Demonstration.from_codes(np.asarray(drawn["demonstration"][0])))
     way = np.asarray(drawn["assignment"]).ravel()
     assert abs(way.mean() - 0.6) < 4 * np.sqrt(0.24 / way.size)
     codes = np.asarray(drawn["demonstration"]).reshape(-1, 3, 3)
-    for d in range(2):
-        policy = np.asarray(soft_plan(mdp, reward_of(mdp, strong[d])).policy)
+    for d, policy in enumerate(np.exp(jax.jit(soft_policies)(mdp, strong))):
         chance = policy[codes[way == d, :, 1], codes[way == d, :, 2]]
         assert chance.min() > 1e-6
         assert (chance.mean(axis=1) > 0.5).mean() > 0.9
@@ -179,20 +190,26 @@ def test_a_simulated_trajectory_is_done_in_its_own_way(mdp):
 
 def test_samples_of_the_law_follow_its_probabilities(mdp, sensor):
     proportions = jnp.array([0.2, 0.5, 0.3])
-    law = MixtureLaw(mdp, proportions, WEIGHTS, sensor, 2)
-    codes = np.asarray(jax.jit(law.sample, static_argnums=1)(jax.random.key(4), (4000,)))
-    values, counts = np.unique(codes.reshape(4000, -1), axis=0, return_counts=True)
-    chance = np.exp(jax.jit(law.log_prob)(jnp.asarray(values.reshape(-1, 2, 3), jnp.int32)))
+
+    @jax.jit
+    def sample(key):
+        return MixtureLaw(mdp, proportions, WEIGHTS, sensor, 2).sample(key, (4000,))
+
+    @jax.jit
+    def log_prob(codes):
+        return MixtureLaw(mdp, proportions, WEIGHTS, sensor, 2).log_prob(codes)
+
+    values, counts = np.unique(sample(jax.random.key(4)).reshape(4000, -1), axis=0, return_counts=True)
+    chance = np.exp(log_prob(jnp.asarray(values.reshape(-1, 2, 3), jnp.int32)))
     assert chance.sum() == pytest.approx(1.0, abs=0.01)
     error = np.sqrt(chance * (1 - chance) / 4000)
     np.testing.assert_array_less(np.abs(counts / 4000 - chance), 5 * error + 1 / 4000)
 
 
 def test_a_random_concentration_is_a_site(mdp, sensor, demonstration):
-    perceived, _ = perceive(mdp, sensor, demonstration.codes)
     values = {**VALUES, "concentration": jnp.array(1.7)}
-    mixed = density(mdp, sensor, perceived, values, concentration=dist.Gamma(2.0, 3.0))
-    fixed = density(mdp, sensor, perceived, concentration=1.7)
+    mixed = density(mdp, sensor, demonstration.codes, values, concentration=dist.Gamma(2.0, 3.0))
+    fixed = density(mdp, sensor, demonstration.codes, concentration=1.7)
     assert mixed - fixed == pytest.approx(float(dist.Gamma(2.0, 3.0).log_prob(1.7)))
 
 
@@ -214,6 +231,8 @@ def test_what_makes_no_mixture_is_refused(mdp, sensor, demonstration):
         call(length=None)
     with pytest.raises(ValueError, match="a proportion for each row"):
         MixtureLaw(mdp, jnp.ones(2) / 2, WEIGHTS, sensor, 3)
-    law = MixtureLaw(mdp, jnp.ones(3) / 3, WEIGHTS, sensor, 3)
     with pytest.raises(ValueError, match=r"shape \[..., 3, 3\]"):
-        law.log_prob(jnp.asarray(demonstration.codes))
+        jax.eval_shape(
+            lambda codes: MixtureLaw(mdp, jnp.ones(3) / 3, WEIGHTS, sensor, 3).log_prob(codes),
+            demonstration.codes,
+        )

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import arviz as az
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import numpyro.distributions as dist
 import pytest
@@ -65,9 +66,14 @@ def demonstration(mdp, sensor):
     return Demonstration.from_codes(codes)
 
 
+@pytest.fixture(scope="module")
+def posteriors(mdp, sensor, demonstration):
+    return {name: sample(jax.random.key(0), mdp, sensor, demonstration) for name, sample in SAMPLERS.items()}
+
+
 @pytest.fixture(scope="module", params=SAMPLERS)
-def idata(request, mdp, sensor, demonstration):
-    return SAMPLERS[request.param](jax.random.key(0), mdp, sensor, demonstration)
+def idata(request, posteriors):
+    return posteriors[request.param]
 
 
 @partial(jax.jit, static_argnames="n")
@@ -205,10 +211,8 @@ def test_partitions_and_weights_agree_with_enumeration(idata, exact):
             assert_mean(drawn[..., i, k], weights[i, k])
 
 
-def test_samplers_agree_on_what_does_not_depend_on_labels(mdp, sensor, demonstration):
-    both = [
-        label_invariant(sample(jax.random.key(0), mdp, sensor, demonstration)) for sample in SAMPLERS.values()
-    ]
+def test_samplers_agree_on_what_does_not_depend_on_labels(posteriors):
+    both = [label_invariant(idata) for idata in posteriors.values()]
     for name in ("n_ways", "log_joint", "log_likelihood"):
         compare(*(x[name].values for x in both), name)
     for rank in range(4):
@@ -307,9 +311,36 @@ def test_draws_are_those_of_the_declared_model(idata, mdp, sensor, demonstration
 
 def test_diagnosis_is_by_what_does_not_depend_on_labels(idata):
     invariant = label_invariant(idata)
-    ranks = az.rhat(invariant[["log_joint", "log_likelihood", "trajectory_weights", "proportion"]])
-    assert all(float(x.max()) < 1.1 for x in ranks.data_vars.values())
-    assert np.isfinite(az.loo(idata).elpd_loo)
+    summary = az.summary(invariant, round_to="none")
+    assert list(summary.index[:3]) == ["n_ways", "log_joint", "log_likelihood"]
+    assert summary.loc["concentration", "mean"] == pytest.approx(float(idata.posterior.concentration.mean()))
+    assert "trajectory_weights[5, turned]" in summary.index
+    assert summary["r_hat"].max() < 1.1
+    assert summary["ess_bulk"].min() > 20
+    axes = az.plot_trace(invariant, var_names=["n_ways", "concentration", "log_joint"], compact=False)
+    assert [axis.get_title() for axis in axes[:, 0]] == ["n_ways", "concentration", "log_joint"]
+    drawn = [line.get_ydata() for line in axes[1, 1].lines[:2]]
+    np.testing.assert_array_equal(drawn, idata.posterior.concentration)
+    plt.close("all")
+    loo = az.loo(idata, pointwise=True)
+    assert loo.loo_i.dims == ("trajectory",)
+    assert loo.n_samples == 1400
+    in_sample = logsumexp(idata.log_likelihood.demonstration.values, axis=(0, 1)) - np.log(1400)
+    assert (loo.loo_i.values < in_sample).all()
+
+
+def test_the_number_of_ways_and_who_shares_one_are_those_of_the_assignments(idata):
+    ways = idata.assignments.assignment.values
+    numbers = np.apply_along_axis(lambda row: len(set(row)), -1, ways)
+    np.testing.assert_array_equal(idata.assignments.n_ways, numbers)
+    chance = idata.assignments.n_ways_probability
+    assert list(chance.ways) == list(range(1, N + 1))
+    np.testing.assert_allclose(chance, [(numbers == k).mean() for k in range(1, N + 1)])
+    together = idata.assignments.co_clustering
+    assert together.dims == ("trajectory", "trajectory_")
+    np.testing.assert_array_equal(np.diag(together), 1.0)
+    pair = together.sel(trajectory=0, trajectory_=4)
+    assert float(pair) == pytest.approx((ways[..., 0] == ways[..., 4]).mean())
 
 
 def test_posterior_survives_a_file(idata, tmp_path):
@@ -321,21 +352,21 @@ def test_posterior_survives_a_file(idata, tmp_path):
     assert back.attrs["truncation_error"] == idata.attrs["truncation_error"] > 0
 
 
-def test_gibbs_writes_out_as_many_components_as_draws_need(mdp, sensor, demonstration):
+def test_gibbs_writes_out_as_many_components_as_draws_need(mdp, sensor, demonstration, posteriors):
     options = {**SAMPLERS["gibbs"].keywords, "components": 1}
     small = gibbs_mixture_posterior(jax.random.key(0), mdp, sensor, demonstration, **options)
-    large = SAMPLERS["gibbs"](jax.random.key(0), mdp, sensor, demonstration)
+    large = posteriors["gibbs"]
     assert (small.assignments.n_ways == large.assignments.n_ways).all()
     assert small.posterior.sizes["component"] == int(small.assignments.n_ways.max()) + 1
 
 
-def test_rows_of_padding_are_no_trajectories(mdp, sensor, demonstration):
+def test_rows_of_padding_are_no_trajectories(mdp, sensor, demonstration, posteriors):
     wide = demonstration.padded(9, LENGTH)
     wide = wide.select([0, 7, 1, 2, 3, 4, 5, 6])
     padded = SAMPLERS["gibbs"](jax.random.key(0), mdp, sensor, wide)
     assert list(padded.assignments.trajectory) == [0, 2, 3, 4, 5, 6]
-    plain = SAMPLERS["gibbs"](jax.random.key(0), mdp, sensor, demonstration)
-    np.testing.assert_array_equal(padded.assignments.assignment, plain.assignments.assignment)
+    plain = posteriors["gibbs"].assignments.assignment
+    np.testing.assert_array_equal(padded.assignments.assignment, plain)
 
 
 def test_wrong_input_is_refused(mdp, sensor, demonstration):
