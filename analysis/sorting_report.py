@@ -12,7 +12,7 @@ import numpy as np
 from ..inference.mtirl import DEFAULT_RESTARTS
 from . import sorting_figures as figures
 from .report import Picture, Section, Table, write_report
-from .sorting_study import SortingStudy
+from .sorting_study import BATCH, DPM, EM, EM_UNTOLD, FEW, METHODS, ONLINE, SortingStudy
 from .sorting_table import (
     HEADINGS,
     behaviours,
@@ -95,20 +95,36 @@ def _title(study: SortingStudy) -> str:
 
 
 def _text(study: SortingStudy) -> str:
-    return f"""Sorters act optimally for one of {study.tasks} rewards; trajectories of {study.steps} steps \
-come in one jumble, without saying which is which. Every method learns from the same ones, \
-{", ".join(map(str, study.counts))} of them, in {study.runs} independent \
-{"run" if study.runs == 1 else "runs"}. MME-MTIRL starts from {study.ways} ways and finds out how many \
-there are; so does DPM-BIRL, which starts from as many as trajectories. EM-MLIRL is given the true number, \
-or, not told, {study.ways}; both from {DEFAULT_RESTARTS} starts. A way counts as found if it is the \
-likeliest of some trajectory.
+    sizes = ", ".join(map(str, study.counts))
+    runs = "one run" if study.runs == 1 else f"{study.runs} independent runs"
+    told = {
+        METHODS[BATCH]: f"MME-MTIRL starts from {study.ways} ways and finds out how many there are.",
+        METHODS[ONLINE]: "Online MME-MTIRL sees every trajectory in one session only and keeps none; it is "
+        "judged on all trajectories so far, each assigned by what it knows now.",
+        METHODS[DPM]: "DPM-BIRL may find as many ways as there are trajectories.",
+        METHODS[EM]: f"EM-MLIRL is given the true number of ways and has {DEFAULT_RESTARTS} starts.",
+        METHODS[EM_UNTOLD]: f"EM-MLIRL that is not told is given {study.ways}, and as many starts.",
+    }
+    methods = " ".join(told[result.name] for result in study.results)
+    return f"""Sorters act optimally for one of {study.tasks} rewards; their trajectories of {study.steps} \
+steps come in one jumble. Learned from: {sizes} trajectories, the same for every method, in {runs}. \
+{methods} A way counts as found if it is the likeliest of some trajectory.
 
-The online learner sees every trajectory in one session only and keeps none. It is judged on all \
-trajectories so far, each assigned by what it knows now.
+The value difference (EVD) compares greedy policies, so a reward that is wrong in many ways may lose exactly \
+nothing. Not all mistakes cost the same: where there is no list, the best roller picks as the picker does, \
+so taking a picker for a roller costs its first steps only.
 
-The value difference (EVD) compares greedy policies. Forced moves cannot be got wrong and a reward that is \
-wrong in many ways may still prescribe the right behaviour: whoever tells the trajectories apart has mostly \
-an EVD of zero, whoever does not has a large one, and little lies between."""
+{_scope(study)}"""
+
+
+def _scope(study: SortingStudy) -> str:
+    """What a study with the default numbers of trajectories leaves open."""
+    if tuple(study.counts) != FEW[study.tasks]:
+        return ""
+    return (
+        "These are few numbers of trajectories, since every method is compiled for each: --trajectories all "
+        "--runs 10 is the dissertation's design."
+    )
 
 
 def print_tables(study: SortingStudy, console: Console) -> None:
@@ -124,6 +140,8 @@ def print_tables(study: SortingStudy, console: Console) -> None:
             table.add_section()
         table.add_row(*map(str, row))
     console.print(table)
+    if _scope(study):
+        console.print(_scope(study), highlight=False)
     print_sorting_table(study.table, console)
 
 

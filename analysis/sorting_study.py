@@ -197,9 +197,9 @@ def study(
     most = int(sizes[-1])
     ends = sizes if sessions is None else np.linspace(0, most, sessions + 1).round().astype(int)[1:]
     sorting = sorting_with_claiming()
-    keys = jax.random.split(jax.random.key(seed), runs + 1)
+    walk, belt = jax.random.split(jax.random.key(seed))
     borders = np.union1d(sizes, ends)
-    streams = [_stream(key, sorting, tasks, borders, steps) for key in keys[:-1]]
+    streams = [_stream(jax.random.fold_in(walk, run), sorting, tasks, borders, steps) for run in range(runs)]
     chosen = [name for name in METHODS if methods is None or name in methods]
     results = []
     for i, method in enumerate(chosen):
@@ -217,7 +217,7 @@ def study(
     advance("sorting belts", None)
     first = streams[0]
     learned = {result.name: _behaviours_of(first.labels, result.found)[:2] for result in results}
-    table = table_7_2(keys[-1], sorting, learned, belts=belts)
+    table = table_7_2(belt, sorting, learned, belts=belts)
     advance("done", 1.0)
     return SortingStudy(
         sorting, tasks, ways, steps, runs, seed, sizes, ends, tuple(results),
