@@ -30,13 +30,13 @@ from ..domains.sorting import (
 from ..models.demonstration import PAD, Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import finite_occupancy, reachable_states
-from .figures import LearningTime, learning_time
+from .figures import set_scale
 from .metrics import greedy_policy, optimal_actions, policy_accuracy
 from .multi_task_metrics import match_ways
 from .style import MARKERS, SMALL, TEXT, Theme, dress, foot, head, new_figure, series_style
 
 if TYPE_CHECKING:
-    from .sorting_study import MethodResult, SortingStudy
+    from .sorting_study import SortingStudy
 
 # -- clusters -----------------------------------------------------------------------------------------
 
@@ -308,24 +308,16 @@ def _border(centre: tuple[float, float], towards: tuple[float, float]) -> tuple[
 
 
 def evd_plot(study: SortingStudy, theme: Theme) -> Figure:
-    """EVD against trajectories: every run a dot, the mean a line, a bar for the middle 80 % of the runs.
+    """EVD against trajectories: every run a dot, the mean a line, a bar over all runs.
 
-    The scale is logarithmic down to half of the smallest value that is not zero, and linear from there to
-    zero.
+    The scale is logarithmic down to a power of ten below the smallest value that is not zero, and linear
+    from there to zero.
     """
     figure = new_figure(theme, 8.6, 4.8)
     axes = figure.subplots()
     for i, result in enumerate(study.results):
-        style = series_style(theme, i)
         values = result.measures.value_difference
-        x = result.trajectories * _beside(i, len(study.results))
-        axes.plot(
-            np.broadcast_to(x, values.shape).ravel(), values.ravel(), linestyle="", markersize=3.5, alpha=0.5,
-            marker=style["marker"], color=style["color"], markeredgewidth=0, clip_on=False,
-        )  # fmt: skip
-        low, high = np.quantile(values, (0.1, 0.9), axis=0)
-        axes.vlines(x, low, high, color=style["color"], linewidth=2.0, alpha=0.6)
-        axes.plot(x, values.mean(0), label=result.name, linewidth=1.6, markersize=6, clip_on=False, **style)
+        _draw_runs(axes, theme, study, i, values, values.mean(0))
     axes.axhline(
         study.one_way, color=theme.ink, linewidth=1.2, linestyle=(0, (1, 1.5)), label="best single behaviour"
     )
@@ -342,9 +334,28 @@ def evd_plot(study: SortingStudy, theme: Theme) -> Figure:
     foot(
         figure,
         theme,
-        f"line: mean of {study.runs} runs (dots); bar: middle 80%; scale linear below {threshold:g}",
+        f"line: mean; dots and bar: all {study.runs} runs; scale linear below {threshold:g}",
     )
     return figure
+
+
+def _draw_runs(
+    axes: Axes,
+    theme: Theme,
+    study: SortingStudy,
+    i: int,
+    values: Float[np.ndarray, "runs T"],
+    middle: Float[np.ndarray, " T"],
+) -> None:
+    """The ``i``-th method's runs, beside those of the others: bands of so many could not be told apart."""
+    style, result = series_style(theme, i), study.results[i]
+    x = result.trajectories * np.exp(0.05 * (i - (len(study.results) - 1) / 2))
+    axes.plot(
+        np.broadcast_to(x, values.shape).ravel(), values.ravel(), linestyle="", markersize=4.5, alpha=0.5,
+        marker=style["marker"], color=style["color"], markeredgewidth=0, clip_on=False,
+    )  # fmt: skip
+    axes.vlines(x, values.min(0), values.max(0), color=style["color"], linewidth=1.6, alpha=0.45)
+    axes.plot(x, middle, label=result.name, linewidth=1.6, markersize=6.5, clip_on=False, **style)
 
 
 def ways_found_plot(study: SortingStudy, theme: Theme) -> Figure:
@@ -385,19 +396,18 @@ def ways_found_plot(study: SortingStudy, theme: Theme) -> Figure:
 
 def time_plot(study: SortingStudy, theme: Theme) -> Figure:
     """Seconds of learning against trajectories; the online learner's are those of all its sessions so far."""
-    times = [_time(result) for result in study.results]
-    figure = learning_time(times, coverage=0.8, theme=theme, title="Learning time, without compilation")
-    _at_counts(figure.axes[0], study)
+    figure = new_figure(theme, 8.6, 4.8)
+    axes = figure.subplots()
+    for i, result in enumerate(study.results):
+        seconds = result.measures.seconds
+        _draw_runs(axes, theme, study, i, seconds, np.median(seconds, axis=0))
+    dress(axes, theme, x="trajectories", y="learning time (s)")
+    set_scale(axes, "y", "log")
+    _at_counts(axes, study)
+    title = "Learning time, without compilation"
+    head(figure, theme, axes.get_legend_handles_labels()[0], title=title)
+    foot(figure, theme, f"line: median; dots and bar: all {study.runs} runs; online: all sessions so far")
     return figure
-
-
-def _time(result: MethodResult) -> LearningTime:
-    return LearningTime(result.name, result.trajectories, result.measures.seconds)
-
-
-def _beside(i: int, n: int) -> float:
-    """Factor that sets methods side by side on a logarithmic axis."""
-    return float(np.exp(0.05 * (i - (n - 1) / 2)))
 
 
 def _at_counts(axes: Axes, study: SortingStudy) -> None:
