@@ -5,15 +5,17 @@ mixture of these laws has proportions of little entropy. The Lagrange dual of th
 of soft-optimal behaviour, and the latter is an entropic prior (:mod:`.entropic`), so that the stationary
 points are those of::
 
-    maximise    sum_{i,d} v_id [log pi_d + sum_{s,a} N_i(s, a) log pi_{theta_d}(a | s)] - sum v_id log v_id
-                + strength sum_d pi_d log pi_d - l1 sum |theta| - ridge/2 sum theta^2
+    maximise    sum_{i,d,s,a} v_id N_i(s, a) log pi_{theta_d}(a | s)
+                + price { sum_{i,d} v_id (log pi_d - log v_id) + strength sum_d pi_d log pi_d }
+                - l1 sum |theta| - ridge/2 sum theta^2
     subject to  log sum_a exp(theta_d.phi(s, a) + gamma sum P(s' | s, a) V_d(s')) = V_d(s)
                 sum_d v_id = 1,  sum_d pi_d = 1,  v >= 0,  pi >= 0
 
 (the sums over ``s, a`` of trajectory ``i`` are ``theta_d.F_i - W_i.V_d``: only those are ever formed). Given
-the rest, the best ``v`` are the posterior probabilities of the ways, at which the maximised function is the
-marginal likelihood of the mixture. Alternating between them, the proportions and the rewards ascends the
-same function; from the same start both mostly, but not always, end on the same of its hills. ``N_i`` is
+the rest, and at ``price`` 1, the best ``v`` are the posterior probabilities of the ways, at which the
+maximised function is the marginal likelihood of the mixture; :mod:`.mixture_fit` says why to pay less.
+Alternating between them, the proportions and the rewards ascends the same function; from the same start both
+mostly, but not always, end on the same of its hills. ``N_i`` is
 conditional on where a trajectory went: two ways that differ in one choice, made once, are a mixture no
 better than one way that tosses a coin.
 """
@@ -97,7 +99,7 @@ class MinMaxSolution(NamedTuple):
     proportions : float ``[D]``
         ``pi_d``; a component that died has one close to zero.
     responsibilities : float ``[n, D]``
-        ``v_{d,i}``, the posterior probabilities of the ways; rows sum to one.
+        ``v_{d,i}``; at ``price`` 1 the posterior probabilities of the ways. Rows sum to one.
     objective : float
         The maximised objective, penalties included (nats).
     iterations : int
@@ -122,6 +124,13 @@ class _Statistics(NamedTuple):
     state_weights: Float[np.ndarray, "D n S"]
 
 
+class _Penalties(NamedTuple):
+    strength: float
+    price: float
+    l1: Float[np.ndarray, " K"]
+    ridge: float
+
+
 class MinMaxProgram:
     """The program above, built once for an MDP, ``components`` and at most so many ``trajectories``.
 
@@ -144,7 +153,8 @@ class MinMaxProgram:
         parts, values = ca.SX.sym("parts", 2 * n_features, components), ca.SX.sym("V", n_states, components)
         features = [ca.SX.sym(f"F{d}", trajectories, n_features) for d in range(components)]
         state_weights = [ca.SX.sym(f"W{d}", trajectories, n_states) for d in range(components)]
-        counted, strength = ca.SX.sym("counted", trajectories), ca.SX.sym("strength")
+        counted = ca.SX.sym("counted", trajectories)
+        strength, price = ca.SX.sym("strength"), ca.SX.sym("price")
         l1, ridge = ca.SX.sym("l1", n_features), ca.SX.sym("ridge")
         theta = parts[:n_features, :] - parts[n_features:, :]
         at_state = sparse.csc_matrix((np.ones(pairs), (self._flow.row, np.arange(pairs))), (n_states, pairs))
@@ -153,17 +163,17 @@ class MinMaxProgram:
         likelihoods = ca.horzcat(
             *[features[d] @ theta[:, d] - state_weights[d] @ values[:, d] for d in range(components)]
         )
-        fit = v * (likelihoods + ca.repmat(ca.log(pi).T, trajectories, 1) - ca.log(v))
+        fit = v * (likelihoods + price * (ca.repmat(ca.log(pi).T, trajectories, 1) - ca.log(v)))
         objective = (
             ca.dot(counted, ca.sum2(fit))
-            + strength * ca.dot(pi, ca.log(pi))
+            + price * strength * ca.dot(pi, ca.log(pi))
             - ca.dot(l1, ca.sum2(parts[:n_features, :] + parts[n_features:, :]))
             - ridge / 2 * ca.dot(theta, theta)
         )
         program = {
             "x": ca.vertcat(ca.vec(v), pi, ca.vec(parts), ca.vec(values)),
             "p": ca.vertcat(
-                *map(ca.vec, features), *map(ca.vec, state_weights), counted, strength, l1, ridge
+                *map(ca.vec, features), *map(ca.vec, state_weights), counted, strength, price, l1, ridge
             ),
             "f": -objective,
             "g": ca.vertcat(ca.sum2(v), ca.sum1(pi), ca.vec(ca.log(ca.DM(at_state) @ ca.exp(advantage)))),
@@ -178,6 +188,7 @@ class MinMaxProgram:
         l1: ArrayLike = 0.0,
         ridge: float = 0.0,
         *,
+        price: float = 1.0,
         responsibilities: ArrayLike | None = None,
         weights: ArrayLike | None = None,
         warm: MinMaxPoint | None = None,
@@ -193,6 +204,8 @@ class MinMaxProgram:
             ``lambda`` of the entropic prior on the proportions.
         l1, ridge : float or ``[K]``, float
             Penalties of each component's weights, in nats in all (a Laplace and a Gaussian prior).
+        price : float
+            What a nat of information of who did what costs, in nats of likelihood; more than zero.
         responsibilities : float ``[n, D]``
             Start: who did what; each component begins at the best weights for its share.
         weights : float ``[D, K]``
@@ -210,7 +223,7 @@ class MinMaxProgram:
             When IPOPT gives up.
         """
         statistics = self._statistics(counts)
-        penalties = self._penalties(strength, l1, ridge)
+        penalties = self._penalties(strength, price, l1, ridge)
         given = {"responsibilities": responsibilities, "weights": weights, "warm": warm}
         named = [name for name, start in given.items() if start is not None]
         if len(named) != 1:
@@ -272,7 +285,7 @@ class MinMaxProgram:
         by_pair = np.broadcast_to(by_pair, (self.components, n, by_pair.shape[-1]))
         return _Statistics(by_pair @ self._flow.features, by_pair @ self._flow.balance.T.toarray())
 
-    def _penalties(self, strength: float, l1: ArrayLike, ridge: float) -> tuple[float, np.ndarray, float]:
+    def _penalties(self, strength: float, price: float, l1: ArrayLike, ridge: float) -> _Penalties:
         slack = np.asarray(l1, float)
         if slack.shape not in ((), (self.mdp.n_features,)):
             raise ValueError(
@@ -281,7 +294,11 @@ class MinMaxProgram:
         for name, value in (("strength", strength), ("l1", slack), ("ridge", ridge)):
             if not (np.isfinite(value) & (np.asarray(value) >= 0)).all():
                 raise ValueError(f"{name} must be finite and not negative, got {value}")
-        return float(strength), np.broadcast_to(slack, (self.mdp.n_features,)), float(ridge)
+        if not (np.isfinite(price) and price > 0):
+            raise ValueError(f"price must be finite and more than zero, got {price}")
+        return _Penalties(
+            float(strength), float(price), np.broadcast_to(slack, (self.mdp.n_features,)), float(ridge)
+        )
 
     @staticmethod
     def _check(given: np.ndarray, shape: tuple[int, ...], name: str, dims: str) -> None:
@@ -305,7 +322,7 @@ class MinMaxProgram:
         )  # fmt: skip
 
     def _from_responsibilities(
-        self, shares: np.ndarray, counts: ArrayLike, penalties: tuple[float, np.ndarray, float]
+        self, shares: np.ndarray, counts: ArrayLike, penalties: _Penalties
     ) -> MinMaxPoint:
         visits = np.asarray(counts, float)
         n = visits.shape[-3]
@@ -315,7 +332,7 @@ class MinMaxProgram:
                 f"rows of responsibilities must be distributions: least {shares.min()}, sums from "
                 f"{shares.sum(1).min()} to {shares.sum(1).max()}"
             )
-        strength, l1, ridge = penalties
+        strength, _, l1, ridge = penalties
         visits = np.broadcast_to(visits, (self.components, *visits.shape[-3:]))
         origin = WarmStart(jnp.zeros(self.mdp.n_features), jnp.zeros(self.mdp.n_states))
         fits = [
@@ -333,12 +350,12 @@ class MinMaxProgram:
     def _run(
         self,
         statistics: _Statistics,
-        penalties: tuple[float, np.ndarray, float],
+        penalties: _Penalties,
         start: MinMaxPoint,
         solver: ca.Function,
     ) -> tuple[MinMaxSolution, str]:
         """Solve from a start; status '' means solved."""
-        strength, l1, ridge = penalties
+        strength, price, l1, ridge = penalties
         (n_components, n, n_features), n_states = statistics.features.shape, self.mdp.n_states
         spare = self.trajectories - n
         absent = np.arange(self.trajectories) >= n
@@ -346,7 +363,7 @@ class MinMaxProgram:
         # Proportions and responsibilities of exactly zero have no logarithm.
         pi = np.maximum(start.proportions, _WARM_BARRIER)
         pi = pi / pi.sum()
-        posterior, evidence = _posterior(statistics, start.parts, start.values, pi)
+        posterior, evidence = _posterior(statistics, start.parts, start.values, pi, price)
         v = np.full((self.trajectories, n_components), 1 / n_components)
         v[:n] = np.maximum(posterior, _WARM_BARRIER / 10)
         v /= v.sum(1, keepdims=True)
@@ -368,7 +385,7 @@ class MinMaxProgram:
         loose = np.append(absent, False)
         # Stationarity in v gives the multipliers of its rows; interior v have none but the barrier's.
         rows = np.zeros(self.trajectories)
-        rows[:n] = evidence - 1.0
+        rows[:n] = evidence - price
         parts = start.parts
         if free.any():
             joined = np.concatenate([parts[:, :n_features] - parts[:, n_features:], zero], axis=1)
@@ -380,7 +397,7 @@ class MinMaxProgram:
                 start.part_multipliers.T, np.zeros_like(start.values.T),
             ),
             lam_g0=_flat(rows, np.array([start.sum_multiplier]), start.bellman_multipliers.T),
-            p=_flat(*(part for table in padded for part in table), ~absent, [strength], l1, [ridge]),
+            p=_flat(*(part for table in padded for part in table), ~absent, [strength], [price], l1, [ridge]),
             lbx=lower, ubx=upper,
             lbg=np.concatenate([np.where(loose, -np.inf, sums), bellman]),
             ubg=np.concatenate([np.where(loose, np.inf, sums), bellman]),
@@ -406,12 +423,12 @@ class MinMaxProgram:
     def _concluded(
         self,
         statistics: _Statistics,
-        penalties: tuple[float, np.ndarray, float],
+        penalties: _Penalties,
         point: MinMaxPoint,
         iterations: int,
         solved: bool,
     ) -> MinMaxSolution:
-        strength, l1, ridge = penalties
+        strength, price, l1, ridge = penalties
         plus, minus = np.split(point.parts, 2, axis=1)
         weights, values = plus - minus, point.values
         if solved:
@@ -423,27 +440,25 @@ class MinMaxProgram:
             )
         pi = np.maximum(point.proportions, 0.0)
         pi = pi / pi.sum()
-        posterior, evidence = _posterior(statistics, point.parts, values, pi)
+        posterior, evidence = _posterior(statistics, point.parts, values, pi, price)
         objective = (
-            evidence.sum() + strength * xlogy(pi, pi).sum()
+            evidence.sum() + price * strength * xlogy(pi, pi).sum()
             - (np.abs(weights) @ l1).sum() - ridge / 2 * (weights**2).sum()
         )  # fmt: skip
         return MinMaxSolution(weights, values, pi, posterior, float(objective), iterations, point)
 
 
 def _posterior(
-    statistics: _Statistics, parts: np.ndarray, values: np.ndarray, proportions: np.ndarray
+    statistics: _Statistics, parts: np.ndarray, values: np.ndarray, proportions: np.ndarray, price: float
 ) -> tuple[Float[np.ndarray, "n D"], Float[np.ndarray, " n"]]:
-    """Posterior probability of each way for each trajectory, and the trajectories' log-evidence."""
+    """The best responsibilities, and what each trajectory then adds to the objective."""
     plus, minus = np.split(parts, 2, axis=1)
+    likelihood = np.einsum("dik,dk->id", statistics.features, plus - minus)
+    likelihood -= np.einsum("dis,ds->id", statistics.state_weights, values)
     with np.errstate(divide="ignore"):
-        joint = (
-            np.log(proportions)
-            + np.einsum("dik,dk->id", statistics.features, plus - minus)
-            - np.einsum("dis,ds->id", statistics.state_weights, values)
-        )
+        joint = np.log(proportions) + likelihood / price
     evidence = logsumexp(joint, axis=1)
-    return np.exp(joint - evidence[:, None]), evidence
+    return np.exp(joint - evidence[:, None]), price * evidence
 
 
 def _flat(*parts: Any) -> np.ndarray:

@@ -247,29 +247,27 @@ def search(
 ) -> Search:
     """Find ways of doing the task: from those known and, if some may be hidden, from ``restarts`` seedings.
 
-    The first start opens no way but those of ``mixture``. Only if it leaves trajectories badly explained, or
-    nothing is known yet, are the empty slots filled, ``restarts`` times over; the best fit is
-    returned.
+    The first start opens no way but those of ``mixture``. Only if these explain trajectories badly, or nothing
+    is known yet, are the empty slots filled, ``restarts`` times over; the best fit is returned.
     """
     known = jnp.any(kept.mass > 0)
     guess = without_reward(program.mdp, jumble)
 
-    def by_known() -> tuple:
-        nowhere, zero = jnp.array(-jnp.inf), jnp.zeros((), int)
-        fit = e_step(program, jumble, kept, mixture, nowhere, zero, zero)
-        return fit.responsibilities, fit.visits
+    nowhere, zero = jnp.array(-jnp.inf), jnp.zeros((), int)
+    expected = e_step(program, jumble, kept, mixture, nowhere, zero, zero)
+    suspicious = ~known | may_hide_a_way(program, jumble, expected)
 
     def step(carry: tuple) -> tuple:
         number, best, scores, _ = carry
-        first = (number == 0) & known
         shares, visits = lax.cond(
-            first,
-            by_known,
+            (number == 0) & known,
+            lambda: (expected.responsibilities, expected.visits),
             lambda: _seeded(program, jumble, guess, kept, jax.random.fold_in(key, number)),
         )
         fit = settle(program, jumble, kept, mixture, shares, visits)
         best = jax.tree.map(lambda x, y: jnp.where(fit.score > best.score, x, y), fit, best)
-        more = jnp.where(number == 0, ~known | may_hide_a_way(program, jumble, fit), True)
+        # Without an empty slot there is nothing to seed.
+        more = suspicious & ((number > 0) | ~known | jnp.any(fit.mixture.proportions == 0))
         return number + 1, best, scores.at[number].set(fit.score), more & (number < restarts)
 
     n_ways = mixture.proportions.shape[0]
@@ -280,25 +278,26 @@ def search(
     return Search(best, tried, reached)
 
 
-def may_hide_a_way(program: MixtureProgram, jumble: Jumble, fit: Fit) -> Bool[Array, ""]:
-    """Whether trajectories are explained so badly that a new way, and an empty slot for it, could pay.
+def may_hide_a_way(program: MixtureProgram, jumble: Jumble, expected: Fit) -> Bool[Array, ""]:
+    """Whether known ways, not yet adapted, explain trajectories so badly that a new way could pay.
 
-    At best a new way predicts every action of the trajectories that it takes over. If even that would not
-    buy the information of who did what, for any number of the worst explained ones, nothing is hidden.
+    At best a new way predicts every action of the trajectories that it takes over; what is kept is explained
+    as well as it can be already. If the new way would not even then buy the information of who did what, for
+    any number of the worst explained trajectories, nothing is hidden.
     """
-    policies, _ = log_policies(program.mdp, fit.mixture.weights, fit.mixture.values)
+    policies, _ = log_policies(program.mdp, expected.mixture.weights, expected.mixture.values)
     explained = explain_each(program.mdp, policies, jumble)
     surprise = -jnp.where(program.mdp.available, policies, 0.0)
-    loss = jnp.einsum("nd,dnsa,dsa->n", fit.responsibilities, explained.visits, surprise)
+    loss = jnp.einsum("nd,dnsa,dsa->n", expected.responsibilities, explained.visits, surprise)
     worst = jnp.argsort(-loss)
-    shares = fit.responsibilities[worst]
+    shares = expected.responsibilities[worst]
     taken = jnp.cumsum(shares, axis=0)
-    mass = fit.kept.mass + jnp.sum(shares, axis=0)
+    mass = expected.kept.mass + jnp.sum(shares, axis=0)
     left = jnp.maximum(mass - taken, 0.0)
     number = jnp.sum(taken, axis=1)
     total = jnp.maximum(jnp.sum(mass), 1e-300)
     undecided = jnp.cumsum(jnp.sum(xlogy(shares, shares), axis=1))
-    price = jnp.sum(xlogy(mass, mass / total)) - jnp.sum(xlogy(left, left / total), axis=1)
-    price = price - xlogy(number, number / total) - undecided
-    pays = jnp.cumsum(loss[worst]) > program.price * price + program.tolerance
-    return jnp.any(pays & (number > 0)) & jnp.any(fit.mixture.proportions == 0)
+    information = jnp.sum(xlogy(mass, mass / total)) - jnp.sum(xlogy(left, left / total), axis=1)
+    information = information - xlogy(number, number / total) - undecided
+    pays = jnp.cumsum(loss[worst]) > program.price * information + program.tolerance
+    return jnp.any(pays & (number > 0))
