@@ -243,7 +243,7 @@ def run_sorting(
         int | None,
         typer.Option(help="Sessions of the online learner; they end at the numbers above unless given."),
     ] = None,
-    ways: Annotated[int, typer.Option(help="Ways that MME-MTIRL starts from.")] = 4,
+    ways: Annotated[int, typer.Option(help="Ways that MME-MTIRL starts from: the most it can find.")] = 4,
     steps: Annotated[int, typer.Option(help="Steps of a trajectory.")] = 50,
     runs: Annotated[int, typer.Option(help="Independent repetitions.")] = 3,
     belts: Annotated[int, typer.Option(help="Simulated belts of Table 7.2.")] = 300,

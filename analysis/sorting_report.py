@@ -82,7 +82,7 @@ def _results_table(study: SortingStudy) -> Table:
     return Table(
         ("method", "N", "EVD (all runs)", "a step", "ways (right in)", "accuracy, %", "Rand", "seconds"),
         rows,
-        f"N: trajectories. EVD: mean of {study.runs} runs, in discounted reward a trajectory; the best "
+        f"N: trajectories. EVD: mean of {_runs(study)}, in discounted reward a trajectory; the best "
         f"single behaviour for all has {study.one_way:.3g}. Ways: median number found. "
         "Rand: adjusted Rand index. "
         f"Seconds: median, without compilation; online: all sessions so far.{online}",
@@ -94,9 +94,12 @@ def _title(study: SortingStudy) -> str:
     return f"Sorting onions in {study.tasks} ways: {', '.join(names[:-1])} and {names[-1]}"
 
 
+def _runs(study: SortingStudy) -> str:
+    return "one run" if study.runs == 1 else f"{study.runs} independent runs"
+
+
 def _text(study: SortingStudy) -> str:
     sizes = ", ".join(map(str, study.counts))
-    runs = "one run" if study.runs == 1 else f"{study.runs} independent runs"
     told = {
         METHODS[BATCH]: f"MME-MTIRL starts from {study.ways} ways and finds out how many there are.",
         METHODS[ONLINE]: "Online MME-MTIRL sees every trajectory in one session only and keeps none; it is "
@@ -107,7 +110,7 @@ def _text(study: SortingStudy) -> str:
     }
     methods = " ".join(told[result.name] for result in study.results)
     return f"""Sorters act optimally for one of {study.tasks} rewards; their trajectories of {study.steps} \
-steps come in one jumble. Learned from: {sizes} trajectories, the same for every method, in {runs}. \
+steps come in one jumble. Learned from: {sizes} trajectories, the same for every method, in {_runs(study)}. \
 {methods} A way counts as found if it is the likeliest of some trajectory.
 
 The value difference (EVD) compares greedy policies, so a reward that is wrong in many ways may lose exactly \
@@ -118,13 +121,19 @@ so taking a picker for a roller costs its first steps only.
 
 
 def _scope(study: SortingStudy) -> str:
-    """What a study with the default numbers of trajectories leaves open."""
-    if tuple(study.counts) != FEW[study.tasks]:
-        return ""
-    return (
-        "These are few numbers of trajectories, since every method is compiled for each: --trajectories all "
-        "--runs 10 is the dissertation's design."
-    )
+    """What the numbers of trajectories leave open; empty if nothing."""
+    told = []
+    if tuple(study.counts) == FEW[study.tasks]:
+        told.append(
+            "These are few numbers of trajectories, since every method is compiled for each: --trajectories "
+            "all --runs 10 is the dissertation's design."
+        )
+    if study.counts[0] < study.ways:
+        told.append(
+            f"From {study.counts[0]} trajectories no more than {study.counts[0]} of the {study.ways} ways "
+            "started from can be found."
+        )
+    return " ".join(told)
 
 
 def print_tables(study: SortingStudy, console: Console) -> None:

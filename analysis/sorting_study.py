@@ -8,6 +8,7 @@ compiles.
 from __future__ import annotations
 
 import time
+import warnings
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -181,7 +182,7 @@ def study(
         The online learner's, equal in size. By default its sessions end at ``counts``, as in the
         dissertation.
     ways : int
-        Ways that MME-MTIRL starts from.
+        Ways that MME-MTIRL starts from: the most it can find.
     steps : int
         Of a trajectory.
     belts : int
@@ -212,7 +213,10 @@ def study(
             measured = _online(sorting, tasks, learner, ends, streams, tell)
         else:
             fits = _batch_fits(sorting.mdp, method, tasks, ways, sizes)
-            measured = _batch(sorting, tasks, METHODS[method], fits, streams, tell)
+            with warnings.catch_warnings():
+                # That fewer trajectories than ways give fewer ways is said once, with the results.
+                warnings.filterwarnings("ignore", "[0-9]+ ways were to be started from")
+                measured = _batch(sorting, tasks, METHODS[method], fits, streams, tell)
         results.append(measured)
     advance("sorting belts", None)
     first = streams[0]
