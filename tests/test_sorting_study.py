@@ -120,6 +120,12 @@ def test_bad_studies_are_told(given, complaint):
         sorting_study.study(**given)
 
 
+def test_numbers_of_trajectories_are_read_from_text():
+    assert sorting_study.counts_of(2, " 8, 16,32") == (8, 16, 32)
+    assert sorting_study.counts_of(3, "all") == sorting_study.GRID[3]
+    assert sorting_study.counts_of(2, None) is None
+
+
 def test_embedding_keeps_distances_of_planar_features():
     rng = np.random.default_rng(0)
     plane, _ = np.linalg.qr(rng.normal(size=(5, 2)))
@@ -195,14 +201,14 @@ def test_figures_show_what_was_measured(theme):
 
 
 def test_command_writes_its_report(tmp_path):
-    command = ["run", "sorting", "--trajectories", "4,6", "--runs", "1", "--method", "em-mlirl", "--steps"]
+    command = ["run", "sorting", "--trajectories", "6", "--runs", "1", "--method", "em-mlirl", "--steps"]
     command += ["20", "--belts", "10", "--json", "--report", str(tmp_path)]
     result = CliRunner().invoke(app, command)
     assert result.exit_code == 0, result.output
     told = json.loads(result.stdout)
     assert told == json.loads((tmp_path / "results.json").read_text())
     assert [m["method"] for m in told["methods"]] == ["EM-MLIRL"]
-    assert told["methods"][0]["trajectories"] == [4, 6]
+    assert told["methods"][0]["trajectories"] == [6]
     page = (tmp_path / "index.html").read_text()
     assert "EM-MLIRL" in page
     assert page.count("<figure>") == 6
