@@ -14,6 +14,7 @@ from numpyro.infer.util import log_density
 from scipy import integrate
 from scipy.special import gammaln, logsumexp
 
+from i2rl.analysis.benchmarks.mixture import Drawn, compare, invariant_statistics, tails
 from i2rl.inference.mixture_gibbs import _move_concentration, gibbs_mixture_posterior
 from i2rl.inference.mixture_posterior import sample_mixture_posterior
 from i2rl.inference.mixture_problem import label_invariant, log_partition
@@ -212,17 +213,46 @@ def test_partitions_and_weights_agree_with_enumeration(idata, exact):
 
 
 def test_samplers_agree_on_what_does_not_depend_on_labels(posteriors):
-    both = [label_invariant(idata) for idata in posteriors.values()]
-    for name in ("n_ways", "log_joint", "log_likelihood"):
-        compare(*(x[name].values for x in both), name)
-    for rank in range(4):
-        compare(*(x.proportion.values[..., rank] for x in both), f"proportion {rank}")
+    compared = compare(0, **posteriors)
+    names = {c.name for c in compared}
+    assert {"2 ways", "concentration", "largest proportion"} < names
+    assert sum("together" in name for name in names) > 4
+    assert len(names) == len(compared) > 25
+    assert tails(compared)["largest z"]["z"] == max((c.z for c in compared), key=abs)
+    assert all(abs(c.z) < 4.5 for c in compared), tails(compared)["largest z"]
 
 
-def compare(one, other, name):
-    squared = sum(x.var() / az.ess(np.asarray(x, float), method="mean") for x in (one, other))
-    z = (one.mean() - other.mean()) / np.sqrt(squared)
-    assert abs(z) < 4.5, f"{name}: z = {z:.2f}"
+def test_what_is_compared_and_ranked_does_not_depend_on_labels(posteriors):
+    idata = posteriors["gibbs"]
+    posterior, group = idata.posterior, idata.assignments
+    drawn = Drawn(
+        *(posterior[name].values for name in ("weights", "proportions", "concentration")),
+        group.assignment.values,
+        idata.log_likelihood.demonstration.values.sum(-1),
+        group.log_joint.values,
+    )
+    order = np.random.default_rng(0).permutation(posterior.sizes["component"])
+    renamed = drawn._replace(
+        weights=drawn.weights[..., order, :],
+        proportions=drawn.proportions[..., order],
+        assignment=np.argsort(order)[drawn.assignment],
+    )
+    assert (renamed.assignment != drawn.assignment).any()
+    ranked = invariant_statistics(drawn, ("home", "turned"))
+    for name, value in invariant_statistics(renamed, ("home", "turned")).items():
+        np.testing.assert_allclose(value, ranked[name], rtol=1e-12, err_msg=name)
+    np.testing.assert_array_equal(ranked["ways"], group.n_ways)
+    together = group.co_clustering.values
+    assert ranked["pairs together"].mean() == pytest.approx((together.sum() - N) / 2)
+
+
+def test_a_biased_sampler_is_found_out(posteriors):
+    biased = posteriors["gibbs"].copy()
+    biased.posterior["concentration"] = biased.posterior.concentration + 0.1
+    worst = tails(compare(0, posteriors["nuts"], biased))
+    assert worst["largest z"]["name"] == "concentration"
+    assert worst["chance of one as large"] < 0.001
+    assert worst["beyond 3"] >= 1 > worst["expected beyond 3"]
 
 
 def test_without_information_partitions_follow_the_process(demonstration, sensor):

@@ -300,7 +300,7 @@ def tails(compared: list[Comparison]) -> dict[str, Any]:
 def main() -> None:
     """Run and publish."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--mixtures", type=int, default=3, help="posteriors that both samplers draw from")
+    parser.add_argument("--mixtures", type=int, default=2, help="posteriors that both samplers draw from")
     parser.add_argument("--replications", type=int, default=208, help="of the calibration of each sampler")
     parser.add_argument("--draws", type=int, default=1200, help="by each of 4 chains compared")
     parser.add_argument("--seed", type=int, default=0)
