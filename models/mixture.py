@@ -308,8 +308,6 @@ def mixture_model(
     """
     if components < 1:
         raise ValueError(f"a mixture needs at least one component, got {components}")
-    if codes is None and (n_trajectories is None or length is None):
-        raise ValueError("without codes the model simulates, and needs n_trajectories and length")
     alpha = concentration_prior(concentration)
     if isinstance(alpha, dist.Distribution):
         alpha = numpyro.sample("concentration", alpha)
@@ -327,6 +325,8 @@ def mixture_model(
         return None
     if codes is not None:
         n_trajectories, length = codes.shape[0], codes.shape[1]
+    if n_trajectories is None or length is None:
+        raise ValueError("without codes the model simulates, and needs n_trajectories and length")
     with numpyro.plate("trajectory", n_trajectories):
         if codes is None:
             way = numpyro.sample("assignment", dist.Categorical(proportions))
