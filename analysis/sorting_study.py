@@ -324,10 +324,12 @@ def _batch(
         for run, stream in enumerate(streams):
             tell(f"{n} trajectories", (i + run / len(streams)) / len(fits))
             part = stream.demonstration.select(slice(0, n))
+            # Other starts for every size: one unlucky start must not spoil a whole curve.
+            key = jax.random.fold_in(stream.key, n)
             if run == 0:
-                last = fit(stream.key, part)
+                last = fit(key, part)
             began = time.perf_counter()
-            found = fit(stream.key, part)
+            found = fit(key, part)
             seconds = time.perf_counter() - began
             column.append(_judged(sorting, tasks, stream.labels[:n], part, found, seconds))
         columns.append(column)

@@ -61,7 +61,7 @@ def test_measures_are_those_of_the_fit_itself():
     sorting = sorting_with_claiming()
     first = jax.random.fold_in(jax.random.split(jax.random.key(3))[0], 0)
     key = sorting_study._stream(first, sorting, 2, study.counts, 20).key
-    again = dpm_birl(sorting.mdp).fit(key, study.demonstration)
+    again = dpm_birl(sorting.mdp).fit(jax.random.fold_in(key, 6), study.demonstration)
     np.testing.assert_array_equal(again.assignments, found.assignments)
     assert last.ways[0, -1] == len(set(again.assignments))
     best = max(
