@@ -29,6 +29,7 @@ bench: $(READY)
 	$(BIN)/python -m i2rl.analysis.benchmarks.planning
 	$(BIN)/python -m i2rl.analysis.benchmarks.posterior
 	$(BIN)/python -m i2rl.analysis.benchmarks.calibration
+	$(BIN)/python -m i2rl.analysis.benchmarks.ways
 	$(BIN)/python -m i2rl.analysis.benchmarks.mixture
 	$(BIN)/python -m i2rl.analysis.benchmarks.coverage
 	$(BIN)/python -m i2rl.analysis.benchmarks.regret

@@ -102,12 +102,27 @@ def explain(mdp: TabularMDP, log_policy: Float[Array, "S A"], jumble: Jumble) ->
     return Explained(log_likelihood, jnp.sum(pairs, axis=1), seen)
 
 
-def explain_each(mdp: TabularMDP, log_policies: Float[Array, "D S A"], jumble: Jumble) -> Explained:
-    """Explain every trajectory by every policy: fields as in :class:`Explained`, with a leading ``D``."""
+def explain_each(
+    mdp: TabularMDP,
+    log_policies: Float[Array, "D S A"],
+    jumble: Jumble,
+    present: Bool[Array, " D"] | None = None,
+) -> Explained:
+    """Explain every trajectory by every policy: fields as in :class:`Explained`, with a leading ``D``.
+
+    Those of policies that are not ``present`` may be anything finite.
+    """
     if isinstance(jumble, SeenWhole):
         return jax.vmap(lambda x: explain(mdp, x, jumble))(log_policies)
     # One policy at a time: a pass holds [n, L, S, A] posteriors, which ways should not multiply.
-    return lax.map(lambda x: explain(mdp, x, jumble), log_policies)
+    if present is None:
+        return lax.map(lambda x: explain(mdp, x, jumble), log_policies)
+    n = len(jumble.live)
+    nothing = Explained(jnp.zeros(n), *(jnp.zeros((n, mdp.n_states, mdp.n_actions)),) * 2)
+    return lax.map(
+        lambda x: lax.cond(x[1], lambda: explain(mdp, x[0], jumble), lambda: nothing),
+        (log_policies, present),
+    )
 
 
 def without_reward(mdp: TabularMDP, jumble: Jumble) -> Explained:

@@ -193,7 +193,7 @@ def e_step(
     """Who did what under these ways, and ``J``; ``before`` is the ``J`` to compare with."""
     policies, values = log_policies(program.mdp, mixture.weights, mixture.values)
     mixture = mixture._replace(values=values)
-    explained = explain_each(program.mdp, policies, jumble)
+    explained = explain_each(program.mdp, policies, jumble, mixture.proportions > 0)
     assigned = assign(explained.log_likelihood, mixture.proportions, jumble.live, program.price)
     objective = objective_of(program, kept, mixture, policies, assigned)
     shares = assigned.responsibilities

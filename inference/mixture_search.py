@@ -36,6 +36,8 @@ from .mixture_fit import (
 
 # Without a prior on the rewards none of them would be worth its price.
 _LEAST_PRECISION = 1e-3
+# Nats that starts are climbed to before the best of them is chosen.
+_LOOSE = 1e-2
 
 
 # -- merging ------------------------------------------------------------------------------------------
@@ -86,7 +88,7 @@ def _merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Arra
     pairs = jnp.array([(a, b) for a in range(ways) for b in range(a + 1, ways)], int).reshape(-1, 2)
     weights, values, proportions = fit.mixture
     policies, _ = log_policies(mdp, weights, values)
-    explained = explain_each(mdp, policies, jumble)
+    explained = explain_each(mdp, policies, jumble, proportions > 0)
     greedy = lax.map(lambda w: jnp.argmax(hard_plan(mdp, reward_of(mdp, w)).optimal, axis=1), weights)
     complexity = _complexity(program, fit.mixture, fit.kept.visits + fit.visits)
     score = fit.objective - jnp.sum(complexity)
@@ -142,22 +144,12 @@ def _merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Arra
     merged = fit._replace(
         mixture=best.mixture, kept=best.kept, responsibilities=best.responsibilities, visits=best.visits
     )
-    return best.score >= score - program.tolerance, merged, score
+    # Where a trajectory cannot be explained at all, nothing is worth more than anything else.
+    return jnp.isfinite(score) & (best.score >= score - program.tolerance), merged, score
 
 
-def settle(
-    program: MixtureProgram,
-    jumble: Jumble,
-    kept: Kept,
-    mixture: Mixture,
-    responsibilities: Float[Array, "n D"],
-    visits: Float[Array, "D S A"],
-) -> Fit:
+def settle(program: MixtureProgram, jumble: Jumble, start: Fit) -> Fit:
     """Climb; merge two ways and climb again, as long as that gains."""
-    if responsibilities.shape[1] == 1:
-        fit = climb(program, jumble, kept, mixture, responsibilities, visits)
-        complexity = _complexity(program, fit.mixture, fit.kept.visits + fit.visits)
-        return fit._replace(score=fit.objective - jnp.sum(complexity))
 
     def step(carry: tuple) -> tuple:
         before, _ = carry
@@ -166,11 +158,13 @@ def settle(
             iterations=before.iterations + fit.iterations,
             solver_iterations=before.solver_iterations + fit.solver_iterations,
         )
+        if start.mixture.proportions.shape[0] == 1:
+            complexity = _complexity(program, fit.mixture, fit.kept.visits + fit.visits)
+            return fit._replace(score=fit.objective - jnp.sum(complexity)), jnp.array(False)
         better, merged, score = _merge_once(program, jumble, fit)
         fit = fit._replace(score=score)
         return jax.tree.map(lambda x, y: jnp.where(better, x, y), merged, fit), better
 
-    start = unmade(program, jumble, kept, mixture, responsibilities, visits)
     return lax.while_loop(lambda carry: carry[1], step, (start, jnp.array(True)))[0]
 
 
@@ -235,20 +229,19 @@ def _seeded(
 
 
 class Search(NamedTuple):
-    """The best fit, how many starts were tried, and the score each reached (``-inf`` where not tried)."""
+    """The best fit, and how many starts were tried."""
 
     fit: Fit
     tried: Int[Array, ""]
-    scores: Float[Array, " starts"]
 
 
 def search(
-    program: MixtureProgram, jumble: Jumble, kept: Kept, mixture: Mixture, key: Array, restarts: int
+    program: MixtureProgram, jumble: Jumble, kept: Kept, mixture: Mixture, key: Array, restarts: Array | int
 ) -> Search:
     """Find ways of doing the task: from those known and, if some may be hidden, from ``restarts`` seedings.
 
-    The first start opens no way but those of ``mixture``. Only if these explain trajectories badly, or nothing
-    is known yet, are the empty slots filled, ``restarts`` times over; the best fit is returned.
+    The first start opens no way but those of ``mixture``. Only if these explain trajectories badly, or there
+    are none yet, are the empty slots filled, ``restarts`` times over; the best fit is returned.
     """
     known = jnp.any(kept.mass > 0)
     guess = without_reward(program.mdp, jumble)
@@ -258,24 +251,28 @@ def search(
     suspicious = ~known | may_hide_a_way(program, jumble, expected)
 
     def step(carry: tuple) -> tuple:
-        number, best, scores, _ = carry
+        number, best, last, _ = carry
         shares, visits = lax.cond(
             (number == 0) & known,
             lambda: (expected.responsibilities, expected.visits),
             lambda: _seeded(program, jumble, guess, kept, jax.random.fold_in(key, number)),
         )
-        fit = settle(program, jumble, kept, mixture, shares, visits)
-        best = jax.tree.map(lambda x, y: jnp.where(fit.score > best.score, x, y), fit, best)
+        fresh = unmade(program, jumble, kept, mixture, shares, visits)
+        # The last round continues the best of the others, until it stands still.
+        start = jax.tree.map(lambda x, y: jnp.where(last, x, y), best, fresh)
+        tolerance = jnp.where(last, program.tolerance, jnp.maximum(program.tolerance, _LOOSE))
+        fit = settle(program._replace(tolerance=tolerance), jumble, start)
+        best = jax.tree.map(lambda x, y: jnp.where(last | (fit.score > best.score), x, y), fit, best)
         # Without an empty slot there is nothing to seed.
         more = suspicious & ((number > 0) | ~known | jnp.any(fit.mixture.proportions == 0))
-        return number + 1, best, scores.at[number].set(fit.score), more & (number < restarts)
+        return number + ~last, best, ~(more & (number + 1 < restarts + known)), last
 
     n_ways = mixture.proportions.shape[0]
     nobody = (jnp.zeros((*jumble.live.shape, n_ways)), jnp.zeros_like(kept.visits))
     none = unmade(program, jumble, kept, mixture, *nobody)
-    start = (jnp.zeros((), int), none, jnp.full(restarts + 1, -jnp.inf), jnp.array(True))
-    tried, best, reached, _ = lax.while_loop(lambda carry: carry[3], step, start)
-    return Search(best, tried, reached)
+    begin = (jnp.zeros((), int), none, jnp.array(False), jnp.array(False))
+    tried, best, _, _ = lax.while_loop(lambda carry: ~carry[3], step, begin)
+    return Search(best, tried)
 
 
 def may_hide_a_way(program: MixtureProgram, jumble: Jumble, expected: Fit) -> Bool[Array, ""]:
@@ -286,7 +283,7 @@ def may_hide_a_way(program: MixtureProgram, jumble: Jumble, expected: Fit) -> Bo
     any number of the worst explained trajectories, nothing is hidden.
     """
     policies, _ = log_policies(program.mdp, expected.mixture.weights, expected.mixture.values)
-    explained = explain_each(program.mdp, policies, jumble)
+    explained = explain_each(program.mdp, policies, jumble, expected.mixture.proportions > 0)
     surprise = -jnp.where(program.mdp.available, policies, 0.0)
     loss = jnp.einsum("nd,dnsa,dsa->n", expected.responsibilities, explained.visits, surprise)
     worst = jnp.argsort(-loss)

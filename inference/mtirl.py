@@ -35,7 +35,7 @@ from .mixture_fit import (
     log_policies,
     nothing_kept,
 )
-from .mixture_search import search
+from .mixture_search import Search, search
 from .session import Learner
 
 DEFAULT_WAYS = 4
@@ -177,14 +177,11 @@ def mme_mtirl(
         "iterations": iterations, "tolerance": tolerance, "sensor": _digest(sensor),
     }  # fmt: skip
 
-    def run(state: MixtureState, jumble: Jumble) -> tuple[MixtureState, MixtureReport]:
-        return _session(program, restarts, state, jumble)
-
-    compiled = jax.jit(run)
     gather = _gathering(mdp, sensor)
 
     def session(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
-        return run(state, seen_in_part(mdp, sensor, demonstration))
+        jumble = seen_in_part(mdp, sensor, demonstration)
+        return _conclude(program, state, *_begin(program, state, jumble, restarts, search))
 
     def init(key: Array) -> MixtureState:
         empty, kept = empty_mixture(mdp, ways), nothing_kept(mdp, ways)
@@ -194,7 +191,7 @@ def mme_mtirl(
         began = time.perf_counter()
         rows = _rows(demonstration)
         jumble = gather(demonstration)
-        new, report = compiled(state, jumble)
+        new, report = _concluded(program, state, *_begin(program, state, jumble, restarts, _searched))
         if not np.isfinite(report.demonstration_log_likelihood):
             _explain_impossible(sensor, mdp, demonstration)
         arrays = {name: np.asarray(value) for name, value in report._asdict().items()}
@@ -253,12 +250,7 @@ def batch_mme_mtirl(
     sensor = Sensor() if sensor is None else sensor
     program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
     gather = _gathering(mdp, sensor)
-
-    @jax.jit
-    def run(key: Array, jumble: Jumble) -> Any:
-        return search(
-            program, jumble, nothing_kept(mdp, ways), empty_mixture(mdp, ways), key, restarts - 1
-        ).fit
+    nothing, empty = nothing_kept(mdp, ways), empty_mixture(mdp, ways)
 
     def fit(key: Array, demonstration: Demonstration) -> Clustering:
         rows = _rows(demonstration)
@@ -268,7 +260,7 @@ def batch_mme_mtirl(
                 "than that can be found",
                 stacklevel=2,
             )
-        found = run(key, gather(demonstration))
+        found = _searched(program, gather(demonstration), nothing, empty, key, restarts).fit
         if not np.isfinite(found.objective):
             _explain_impossible(sensor, mdp, demonstration)
         proportions = np.asarray(found.mixture.proportions)
@@ -343,6 +335,8 @@ def _program(
     for name, value in (("strength", strength), ("price", price), ("l1", l1), ("ridge", ridge)):
         if not value >= 0:
             raise ValueError(f"{name} must not be negative, got {value}")
+    if price == 0:
+        raise ValueError("price must be more than zero: every trajectory would be a way of its own")
     reachable = jnp.asarray(reachable_states(mdp))
     return MixtureProgram(mdp, reachable, strength, l1, ridge, price, iterations, tolerance)
 
@@ -373,15 +367,23 @@ def _explain_impossible(sensor: Imperfection, mdp: TabularMDP, demonstration: De
     raise DemonstrationError("a trajectory has probability zero under every way of doing the task")
 
 
-def _session(
-    program: MixtureProgram, restarts: int, state: MixtureState, jumble: Jumble
-) -> tuple[MixtureState, MixtureReport]:
-    mdp = program.mdp
+# Compiled once for all learners of one shape of problem, batch and online.
+_searched = jax.jit(search)
+
+
+def _begin(
+    program: MixtureProgram, state: MixtureState, jumble: Jumble, restarts: int, find: Callable[..., Search]
+) -> tuple[Search, Array]:
     key, seed = jax.random.split(state.key)
     kept = Kept(state.mass, state.visits)
     mixture = Mixture(state.weights, state.values, state.proportions)
-    found = search(program, jumble, kept, mixture, seed, restarts)
-    fit = found.fit
+    return find(program, jumble, kept, mixture, seed, restarts), key
+
+
+def _conclude(
+    program: MixtureProgram, state: MixtureState, found: Search, key: Array
+) -> tuple[MixtureState, MixtureReport]:
+    mdp, fit = program.mdp, found.fit
     mass = fit.kept.mass + jnp.sum(fit.responsibilities, axis=0)
     learned = MixtureState(*fit.mixture, mass, fit.kept.visits + fit.seen, state.session + 1, key)
 
@@ -411,3 +413,6 @@ def _session(
     # An observation that cannot be must not spoil what was learned (a fleet raises nothing).
     possible = jnp.isfinite(own)
     return jax.tree.map(partial(jnp.where, possible), learned, state), MixtureReport(**fields)
+
+
+_concluded = jax.jit(_conclude)

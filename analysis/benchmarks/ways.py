@@ -25,7 +25,7 @@ from jaxtyping import Int
 from ...domains.sorting import MixedDemonstration, Sorting, demonstrate_sorting, sorting_with_claiming
 from ...inference.mtirl import assign_trajectories, batch_mme_mtirl, mme_mtirl
 from ...inference.session import Learner
-from ...models import Demonstration, Sensor, TrajectoryLaw, concatenate
+from ...models import Demonstration, Sensor, TrajectoryLaw, Visibility, concatenate
 from ...models.demonstration import HIDDEN, UNKNOWN
 from ..multi_task_metrics import adjusted_rand_index, assignment_accuracy, expected_value_difference
 from .harness import print_table, publish, seconds
@@ -135,7 +135,8 @@ def hidden_steps(
     sorting: Sorting, tasks: int, n: int, share: float, seeds: Sequence[int]
 ) -> list[dict[str, Any]]:
     """Trajectories that were seen in part."""
-    batch, records = batch_mme_mtirl(sorting.mdp), []
+    sensor = Visibility(np.full(sorting.mdp.n_states, 1 - share))
+    batch, records = batch_mme_mtirl(sorting.mdp, sensor), []
     for seed in seeds:
         key = jax.random.key(seed)
         whole, labels = demonstrate_sorting(key, sorting, [n // tasks] * tasks, STEPS)
@@ -189,7 +190,7 @@ def main() -> None:
         publish("ways", results)
         return results[name]
 
-    rows = []
+    rows: list[tuple[Any, ...]] = []
     for tasks, n, size in ((2, 64, 4), (2, 128, 8), (3, 96, 6), (3, 192, 12)):
         runs = record(
             f"online, {tasks} tasks, n = {n}",
