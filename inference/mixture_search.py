@@ -258,19 +258,20 @@ def search(
             lambda: _seeded(program, jumble, guess, kept, jax.random.fold_in(key, number)),
         )
         fresh = unmade(program, jumble, kept, mixture, shares, visits)
-        # The last round continues the best of the others, until it stands still.
-        start = jax.tree.map(lambda x, y: jnp.where(last, x, y), best, fresh)
+        # The last round of several continues the best of the others, until it stands still.
+        start = jax.tree.map(lambda x, y: jnp.where(last & suspicious, x, y), best, fresh)
         tolerance = jnp.where(last, program.tolerance, jnp.maximum(program.tolerance, _LOOSE))
         fit = settle(program._replace(tolerance=tolerance), jumble, start)
         best = jax.tree.map(lambda x, y: jnp.where(last | (fit.score > best.score), x, y), fit, best)
         # Without an empty slot there is nothing to seed.
         more = suspicious & ((number > 0) | ~known | jnp.any(fit.mixture.proportions == 0))
-        return number + ~last, best, ~(more & (number + 1 < restarts + known)), last
+        tried = number + ~(last & suspicious)
+        return tried, best, ~(more & (tried < restarts + known)), last
 
     n_ways = mixture.proportions.shape[0]
     nobody = (jnp.zeros((*jumble.live.shape, n_ways)), jnp.zeros_like(kept.visits))
     none = unmade(program, jumble, kept, mixture, *nobody)
-    begin = (jnp.zeros((), int), none, jnp.array(False), jnp.array(False))
+    begin = (jnp.zeros((), int), none, ~suspicious, jnp.array(False))
     tried, best, _, _ = lax.while_loop(lambda carry: ~carry[3], step, begin)
     return Search(best, tried)
 
