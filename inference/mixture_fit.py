@@ -157,6 +157,11 @@ def assign(
     )
 
 
+def proportions_of(program: MixtureProgram, mass: Float[Array, " D"]) -> Float[Array, " D"]:
+    """The best proportions after so many trajectories of each way; of none, all slots stay empty."""
+    return jnp.where(jnp.sum(mass) > 0, entropic_proportions(mass, program.strength), 0.0)
+
+
 def penalty(program: MixtureProgram, weights: Float[Array, "*D K"]) -> Float[Array, ""]:
     """What the priors on the weights take off ``J``, in nats."""
     return program.l1 * jnp.sum(jnp.abs(weights)) + program.ridge / 2 * jnp.sum(weights**2)
@@ -215,7 +220,7 @@ def _m_step(
         return solution.weights, solution.values, solution.iterations
 
     fitted = lax.map(reward, (kept.visits + visits, mixture.weights, mixture.values))
-    proportions = entropic_proportions(kept.mass + mass, program.strength)
+    proportions = proportions_of(program, kept.mass + mass)
     return Mixture(fitted[0], fitted[1], proportions), jnp.sum(fitted[2])
 
 

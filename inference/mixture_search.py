@@ -17,7 +17,6 @@ from jax.scipy.special import xlogy
 from jaxtyping import Array, Bool, Float, Int
 
 from ..models.planning import hard_plan, reward_of, soft_plan
-from .entropic import entropic_proportions
 from .jumble import Explained, Jumble, SeenWhole, explain, explain_each, without_reward
 from .maxent import WarmStart, count_information, fit_counts
 from .mixture_fit import (
@@ -31,6 +30,7 @@ from .mixture_fit import (
     log_policies,
     objective_of,
     penalty,
+    proportions_of,
     unmade,
 )
 
@@ -109,7 +109,7 @@ def _merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Arra
 
         def refit() -> _Trial:
             solution = fit_counts(mdp, together, program.l1, program.ridge, WarmStart(weights[a], values[a]))
-            proportion = entropic_proportions(kept.mass + jnp.sum(shares, axis=0), program.strength)
+            proportion = proportions_of(program, kept.mass + jnp.sum(shares, axis=0))
             new = Mixture(
                 weights.at[a].set(solution.weights).at[b].set(0.0),
                 values.at[a].set(solution.values),
@@ -132,9 +132,8 @@ def _merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Arra
             pair_mass = mass[a] + mass[b]
             saved = xlogy(pair_mass, pair_mass) - xlogy(mass[a], mass[a]) - xlogy(mass[b], mass[b])
             lost = own[a] + own[b] - _best_possible(together)
-            spared = (
-                program.price * program.strength + penalty(program, weights[a]) + penalty(program, weights[b])
-            )
+            spared = program.price * program.strength + complexity[a] + complexity[b]
+            spared += penalty(program, weights[a]) + penalty(program, weights[b])
             worth &= same | (lost <= program.price * saved + spared)
         trial = lax.cond(worth, refit, lambda: nothing)
         return trial._replace(score=jnp.where(worth & same, jnp.inf, trial.score))
@@ -281,7 +280,8 @@ def may_hide_a_way(program: MixtureProgram, jumble: Jumble, expected: Fit) -> Bo
 
     At best a new way predicts every action of the trajectories that it takes over; what is kept is explained
     as well as it can be already. If the new way would not even then buy the information of who did what, for
-    any number of the worst explained trajectories, nothing is hidden.
+    any number of the worst explained trajectories, nothing is taken to be hidden. (Actions that were not
+    seen count as the known ways guess them: a way that differs only where nobody looks is not suspected.)
     """
     policies, _ = log_policies(program.mdp, expected.mixture.weights, expected.mixture.values)
     explained = explain_each(program.mdp, policies, jumble, expected.mixture.proportions > 0)

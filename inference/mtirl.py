@@ -168,7 +168,7 @@ def mme_mtirl(
     Raises
     ------
     ValueError
-        For discount 1, fewer than one way, or negative penalties.
+        For discount 1, fewer than one way, or settings that are negative or not finite.
     """
     sensor = Sensor() if sensor is None else sensor
     program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
@@ -176,8 +176,6 @@ def mme_mtirl(
         "ways": ways, "strength": strength, "price": price, "l1": l1, "ridge": ridge, "restarts": restarts,
         "iterations": iterations, "tolerance": tolerance, "sensor": _digest(sensor),
     }  # fmt: skip
-
-    gather = _gathering(mdp, sensor)
 
     def session(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
         jumble = seen_in_part(mdp, sensor, demonstration)
@@ -190,7 +188,7 @@ def mme_mtirl(
     def update(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
         began = time.perf_counter()
         rows = _rows(demonstration)
-        jumble = gather(demonstration)
+        jumble = _gather(mdp, sensor, demonstration)
         new, report = _concluded(program, state, *_begin(program, state, jumble, restarts, _searched))
         if not np.isfinite(report.demonstration_log_likelihood):
             _explain_impossible(sensor, mdp, demonstration)
@@ -202,9 +200,7 @@ def mme_mtirl(
 
     @jax.jit
     def likelihood(state: MixtureState, weights: Float[Array, "D K"]) -> Float[Array, ""]:
-        policies, _ = log_policies(mdp, weights, state.values)
-        known = jnp.sum(state.visits * jnp.where(mdp.available, policies, 0.0))
-        return known / jnp.maximum(jnp.sum(state.mass), 1.0)
+        return _kept_log_likelihood(mdp, state, weights)
 
     def log_likelihood(state: MixtureState, weights: Float[Array, "D K"]) -> float:
         return float(likelihood(state, jnp.asarray(weights, float)))
@@ -249,7 +245,6 @@ def batch_mme_mtirl(
     """
     sensor = Sensor() if sensor is None else sensor
     program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
-    gather = _gathering(mdp, sensor)
     nothing, empty = nothing_kept(mdp, ways), empty_mixture(mdp, ways)
 
     def fit(key: Array, demonstration: Demonstration) -> Clustering:
@@ -260,7 +255,7 @@ def batch_mme_mtirl(
                 "than that can be found",
                 stacklevel=2,
             )
-        found = _searched(program, gather(demonstration), nothing, empty, key, restarts).fit
+        found = _searched(program, _gather(mdp, sensor, demonstration), nothing, empty, key, restarts).fit
         if not np.isfinite(found.objective):
             _explain_impossible(sensor, mdp, demonstration)
         proportions = np.asarray(found.mixture.proportions)
@@ -296,11 +291,23 @@ def assign_trajectories(
 ) -> Float[np.ndarray, "n D"]:
     """Probability that each trajectory was done in each of these ways, hidden steps summed out.
 
-    By Bayes' rule alone (price 1), for any trajectories. Raises as :func:`mme_mtirl`'s ``update`` does.
+    By Bayes' rule alone (price 1), for any trajectories. Raises as :func:`mme_mtirl`'s ``update`` does, and
+    ``ValueError`` for weights that are not finite, proportions that are negative or all zero, or shapes that
+    do not fit.
     """
+    weights, proportions = np.asarray(weights, float), np.asarray(proportions, float)
+    if weights.shape != (*proportions.shape, mdp.n_features) or weights.ndim != 2:
+        raise ValueError(
+            f"weights and proportions must have shapes [D, {mdp.n_features}] and [D], got "
+            f"{list(weights.shape)} and {list(proportions.shape)}"
+        )
+    if not np.isfinite(weights).all():
+        raise ValueError(f"weights must be finite, got {weights[~np.isfinite(weights)][0]}")
+    if not (np.isfinite(proportions) & (proportions >= 0)).all() or not proportions.any():
+        raise ValueError(f"proportions must be finite, not negative and not all zero, got {proportions}")
     sensor, rows = Sensor() if sensor is None else sensor, _rows(demonstration)
-    jumble = _gathering(mdp, sensor)(demonstration)
-    assigned = _assigned(mdp, jnp.asarray(weights, float), jnp.asarray(proportions, float), jumble)
+    jumble = _gather(mdp, sensor, demonstration)
+    assigned = _assigned(mdp, jnp.asarray(weights), jnp.asarray(proportions), jumble)
     if not np.isfinite(assigned.log_likelihood).all():
         _explain_impossible(sensor, mdp, demonstration)
     return np.asarray(assigned.responsibilities)[rows]
@@ -333,25 +340,26 @@ def _program(
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
     for name, value in (("strength", strength), ("price", price), ("l1", l1), ("ridge", ridge)):
-        if not value >= 0:
-            raise ValueError(f"{name} must not be negative, got {value}")
+        if not 0 <= value < float("inf"):
+            raise ValueError(f"{name} must be finite and not negative, got {value}")
+    if np.isnan(tolerance):
+        raise ValueError("tolerance must be a number of nats, got nan")
     if price == 0:
         raise ValueError("price must be more than zero: every trajectory would be a way of its own")
     reachable = jnp.asarray(reachable_states(mdp))
     return MixtureProgram(mdp, reachable, strength, l1, ridge, price, iterations, tolerance)
 
 
-def _gathering(mdp: TabularMDP, sensor: Imperfection) -> Callable[[Demonstration], Jumble]:
-    whole, in_part = (jax.jit(partial(f, mdp, sensor)) for f in (seen_whole, seen_in_part))
+_seen_whole, _seen_in_part = jax.jit(seen_whole), jax.jit(seen_in_part)
 
-    def gather(demonstration: Demonstration) -> Jumble:
-        padded = demonstration.bucketed()
-        if not is_seen_whole(sensor, demonstration):
-            return in_part(padded)
-        # Visits of a few trajectories more cost less than compiling for one shape more.
-        return whole(padded.padded(max(padded.n_trajectories, _FEWEST_ROWS), padded.kind.shape[1]))
 
-    return gather
+def _gather(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> Jumble:
+    padded, seen_by = demonstration.bucketed(), Sensor(sensor.presence, sensor.reading)
+    if not is_seen_whole(sensor, demonstration):
+        return _seen_in_part(mdp, seen_by, padded)
+    # Visits of a few trajectories more cost less than compiling for one shape more.
+    rows = max(padded.n_trajectories, _FEWEST_ROWS)
+    return _seen_whole(mdp, seen_by, padded.padded(rows, padded.kind.shape[1]))
 
 
 def _rows(demonstration: Demonstration) -> Int[np.ndarray, " n"]:
@@ -380,6 +388,16 @@ def _begin(
     return find(program, jumble, kept, mixture, seed, restarts), key
 
 
+def _kept_log_likelihood(
+    mdp: TabularMDP, state: MixtureState, weights: Float[Array, "D K"]
+) -> Float[Array, ""]:
+    """Of all that is kept, under these weights and the state's proportions, in nats per trajectory."""
+    policies, _ = log_policies(mdp, weights, state.values)
+    done = jnp.sum(state.visits * jnp.where(mdp.available, policies, 0.0))
+    chosen = state.mass @ jnp.log(jnp.where(state.proportions > 0, state.proportions, 1.0))
+    return (done + chosen) / jnp.maximum(jnp.sum(state.mass), 1.0)
+
+
 def _conclude(
     program: MixtureProgram, state: MixtureState, found: Search, key: Array
 ) -> tuple[MixtureState, MixtureReport]:
@@ -388,18 +406,15 @@ def _conclude(
     learned = MixtureState(*fit.mixture, mass, fit.kept.visits + fit.seen, state.session + 1, key)
 
     def known(weights: Float[Array, "D K"]) -> Float[Array, ""]:
-        policies, _ = log_policies(mdp, weights, fit.mixture.values)
-        return jnp.sum(learned.visits * jnp.where(mdp.available, policies, 0.0))
+        return _kept_log_likelihood(mdp, learned, weights)
 
-    total = jnp.sum(mass)
     present = fit.mixture.proportions > 0
-    log_proportions = jnp.log(jnp.where(present, fit.mixture.proportions, 1.0))
     own = jnp.sum(fit.log_likelihood)
     fields: dict[str, Any] = {
         "session": state.session + 1,
-        "log_likelihood": (known(fit.mixture.weights) + mass @ log_proportions) / jnp.maximum(total, 1.0),
+        "log_likelihood": known(fit.mixture.weights),
         "demonstration_log_likelihood": own,
-        "gradient": jnp.linalg.norm(jax.grad(known)(state.weights)) / jnp.maximum(total, 1.0),
+        "gradient": jnp.linalg.norm(jax.grad(known)(state.weights)),
         "iterations": fit.iterations,
         "solver_iterations": fit.solver_iterations,
         "seconds": jnp.array(jnp.nan),

@@ -22,13 +22,14 @@ from i2rl.inference.mixture_fit import (
     empty_mixture,
     nothing_kept,
 )
+from i2rl.inference.mixture_search import _merge_once
 from i2rl.inference.mtirl import assign_trajectories
 from i2rl.models import Demonstration, TrajectoryLaw, Visibility
 from i2rl.models.demonstration import HIDDEN, LOST
 from i2rl.models.planning import reachable_states, reward_of, soft_plan
 
 WAYS, LENGTH = 3, 10
-climbed = jax.jit(climb)
+climbed, merged = jax.jit(climb), jax.jit(_merge_once)
 
 
 @pytest.fixture(scope="module")
@@ -152,6 +153,28 @@ def test_the_climb_ends_where_every_part_is_best(mdp, program, whole):
         assert (
             objective_of(mdp, program, whole, kept, moved, fit.responsibilities) < float(fit.objective) + 1e-6
         )
+
+
+def test_mergers_that_are_not_tried_would_not_have_paid(mdp, program):
+    """Trajectories seen whole spare mergers; the same ones, completed where nothing is missing, do not."""
+    sensor = Visibility(np.ones(5, bool))
+    laws = [TrajectoryLaw(mdp, jnp.array(w), sensor, LENGTH) for w in ([1.8, -1.2, 0.6], [-1.2, 1.8, -1.8])]
+    codes = [np.asarray(law.sample(jax.random.key(i), (6,))) for i, law in enumerate(laws)]
+    demonstration = Demonstration.from_codes(np.concatenate(codes))
+    whole, in_part = (f(mdp, sensor, demonstration) for f in (seen_whole, seen_in_part))
+    taken = []
+    for swapped, price in product((0, 1, 2), (0.2, 0.6)):
+        labels = np.roll(np.repeat([0, 1], 6), swapped)
+        shares = jnp.eye(WAYS)[labels]
+        cheap = program._replace(price=price, ridge=0.02, iterations=1)
+        visits = jnp.einsum("nd,nsa->dsa", shares, whole.visits)
+        fit = climbed(cheap, whole, nothing_kept(mdp, WAYS), empty_mixture(mdp, WAYS), shares, visits)
+        (paid, one, _), (pays, other, _) = (merged(cheap, jumble, fit) for jumble in (whole, in_part))
+        assert paid == pays
+        if paid:
+            np.testing.assert_allclose(one.mixture.weights, other.mixture.weights, atol=1e-6)
+        taken.append(bool(paid))
+    assert set(taken) == {False, True}
 
 
 @given(

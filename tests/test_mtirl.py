@@ -9,7 +9,14 @@ import pytest
 
 from i2rl.analysis.multi_task_metrics import assignment_accuracy, expected_value_difference
 from i2rl.domains.sorting import demonstrate_sorting, sorting_with_claiming
-from i2rl.inference import assign_trajectories, batch_mme_mtirl, clustering_of, mme_mtirl, run_sessions
+from i2rl.inference import (
+    assign_trajectories,
+    batch_mme_mtirl,
+    clustering_of,
+    mme_mtirl,
+    run_sessions,
+    run_streams,
+)
 from i2rl.inference.journal import Journal
 from i2rl.models import (
     Demonstration,
@@ -19,7 +26,7 @@ from i2rl.models import (
     Visibility,
     concatenate,
 )
-from i2rl.models.demonstration import HIDDEN, UNKNOWN
+from i2rl.models.demonstration import HIDDEN, PAD, UNKNOWN
 
 STEPS = 50
 
@@ -167,6 +174,26 @@ def test_at_the_full_price_people_who_err_are_not_split_by_their_errors(sorting,
         assert assignment_accuracy(np.repeat(behaviours, 16), found.assignments) > 0.85
 
 
+def test_what_a_report_says_of_all_that_is_kept_is_the_learner_s_log_likelihood(sorting, online):
+    demonstration, _ = shuffled_stream(sorting, 6, (6, 6))
+    state = online.init(jax.random.key(0))
+    for session in demonstration.sessions(4):
+        state, report = online.update(state, session)
+        assert online.log_likelihood(state, state.weights) == pytest.approx(report.log_likelihood, abs=1e-9)
+    assert online.log_likelihood(state, np.zeros_like(state.weights)) < report.log_likelihood
+
+
+def test_streams_whose_first_session_is_empty_learn_from_the_next(sorting):
+    learner = mme_mtirl(sorting.mdp, ways=2, restarts=1)
+    demonstration = demonstrate_sorting(jax.random.key(0), sorting, (2, 2), 20).demonstration
+    empty = demonstration._replace(kind=np.full_like(demonstration.kind, PAD))
+    stream = jax.tree.map(lambda *x: np.stack(x)[None], empty, demonstration, empty)
+    state, report = run_streams(learner, jax.random.key(0), stream)
+    np.testing.assert_array_equal(report.ways, [[0, 2, 2]])
+    np.testing.assert_allclose(state.mass.sum(), 4, atol=1e-9)
+    assert np.isfinite(report.log_likelihood).all()
+
+
 # -- bad input ----------------------------------------------------------------------------------------
 
 
@@ -175,8 +202,10 @@ def test_at_the_full_price_people_who_err_are_not_split_by_their_errors(sorting,
     [
         ({"ways": 0}, "ways must be at least 1, got 0"),
         ({"price": 0.0}, "price must be more than zero"),
-        ({"ridge": -1.0}, "ridge must not be negative"),
-        ({"strength": float("nan")}, "strength must not be negative"),
+        ({"ridge": -1.0}, "ridge must be finite and not negative"),
+        ({"strength": float("nan")}, "strength must be finite and not negative, got nan"),
+        ({"price": float("inf")}, "price must be finite"),
+        ({"tolerance": float("nan")}, "tolerance must be a number"),
     ],
 )
 @pytest.mark.parametrize("learner", [mme_mtirl, batch_mme_mtirl])
@@ -234,3 +263,27 @@ def test_no_trajectories_are_nothing_to_learn_from(sorting, batch):
     nothing = Demonstration.from_codes(np.zeros((0, 5, 3), int))
     with pytest.raises(DemonstrationError, match="at least one trajectory"):
         batch.fit(jax.random.key(0), nothing)
+
+
+@pytest.mark.parametrize(
+    ("weights", "proportions", "message"),
+    [
+        (np.zeros((2, 3)), np.full(2, 0.5), r"shapes \[D, 11\] and \[D\], got \[2, 3\] and \[2\]"),
+        (np.zeros((2, 11)), np.ones(1), r"got \[2, 11\] and \[1\]"),
+        (np.full((1, 11), np.nan), np.ones(1), "weights must be finite, got nan"),
+        (np.zeros((2, 11)), np.zeros(2), "not all zero"),
+    ],
+)
+def test_ways_that_are_none_are_refused(sorting, weights, proportions, message):
+    demonstration = demonstrate_sorting(jax.random.key(0), sorting, (1, 1), STEPS).demonstration
+    with pytest.raises(ValueError, match=message):
+        assign_trajectories(sorting.mdp, None, weights, proportions, demonstration)
+
+
+def test_a_hidden_step_is_named_where_nothing_can_hide(sorting):
+    demonstration = demonstrate_sorting(jax.random.key(0), sorting, (2, 2), STEPS).demonstration
+    kind = np.array(demonstration.kind)
+    kind[1, 3] = HIDDEN
+    hidden = demonstration._replace(kind=kind)
+    with pytest.raises(DemonstrationError, match="trajectory 1, step 3: impossible observation: hidden"):
+        assign_trajectories(sorting.mdp, None, sorting.weights, np.full(3, 1 / 3), hidden)
