@@ -38,6 +38,9 @@ from .style import MARKERS, SMALL, TEXT, Theme, dress, foot, head, new_figure, s
 if TYPE_CHECKING:
     from .sorting_study import SortingStudy
 
+# Legends and notes need so many inches, however few the panels are.
+_WIDTH_OF_TEXT = 6.5
+
 # -- clusters -----------------------------------------------------------------------------------------
 
 
@@ -83,7 +86,7 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
     results = study.results
     columns = min(3, len(results))
     rows = -(-len(results) // columns)
-    figure = new_figure(theme, 1.4 + 3.1 * columns, 1.6 + 2.7 * rows)
+    figure = new_figure(theme, max(1.4 + 3.1 * columns, _WIDTH_OF_TEXT), 1.6 + 2.7 * rows)
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     most = 1
     for i, (panel, result) in enumerate(zip(panels, results, strict=False)):
@@ -119,8 +122,8 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
                label=f"found: way {d + 1}" + (" (more reuse colours)" if d == 5 < most - 1 else ""))
         for d in range(min(most, 6))
     ]  # fmt: skip
-    head(figure, theme, handles, title=f"{len(study.labels)} trajectories, first run", columns=columns)
-    told = "; ".join(f"component {k + 1}: {_loading(mdp, embedding.loadings[k])}" for k in range(2))
+    head(figure, theme, handles, title=f"{len(study.labels)} trajectories, first run")
+    told = ";\n".join(f"component {k + 1}: {_loading(mdp, embedding.loadings[k])}" for k in range(2))
     foot(figure, theme, told)
     return figure
 
@@ -199,7 +202,7 @@ def ways_diagram(study: SortingStudy, theme: Theme) -> Figure:
     sizes = np.bincount(result.found.assignments)
     ways = _numbered(study.labels, result.found.assignments)
     shown = ways[:_DIAGRAMS]
-    figure = new_figure(theme, max(0.4 + 5.2 * len(shown), 6.5), 5.9)
+    figure = new_figure(theme, max(0.4 + 5.2 * len(shown), _WIDTH_OF_TEXT), 5.9)
     figure.get_layout_engine().set(wspace=0.06)  # type: ignore[union-attr, call-arg]
     panels = figure.subplots(1, len(shown), squeeze=False)[0]
     behaviour_of = {d: b for b, d in match_ways(study.labels, result.found.assignments).items()}
@@ -334,7 +337,7 @@ def evd_plot(study: SortingStudy, theme: Theme) -> Figure:
     foot(
         figure,
         theme,
-        f"line: mean; dots and bar: all {study.runs} runs; scale linear below {threshold:g}",
+        f"line: mean; dots and bar: {_all_runs(study)}; scale linear below {threshold:g}",
     )
     return figure
 
@@ -361,7 +364,7 @@ def _draw_runs(
 def ways_found_plot(study: SortingStudy, theme: Theme) -> Figure:
     """How many ways were found: at each number of trajectories a disc as large as the share of runs."""
     results = study.results
-    figure = new_figure(theme, 1.2 + 2.3 * len(results), 3.9)
+    figure = new_figure(theme, max(1.2 + 2.3 * len(results), _WIDTH_OF_TEXT), 3.9)
     panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
     most = max(int(result.measures.ways.max()) for result in results)
     # Discs of one column or row must not touch.
@@ -390,7 +393,7 @@ def ways_found_plot(study: SortingStudy, theme: Theme) -> Figure:
         Line2D([], [], color=theme.goal, linewidth=1.6, label=f"truth: {study.tasks}"),
     ]
     head(figure, theme, handles, title="Number of ways found")
-    foot(figure, theme, f"area of a disc: share of {study.runs} runs")
+    foot(figure, theme, f"area of a disc: share of {_all_runs(study)}")
     return figure
 
 
@@ -406,8 +409,12 @@ def time_plot(study: SortingStudy, theme: Theme) -> Figure:
     _at_counts(axes, study)
     title = "Learning time, without compilation"
     head(figure, theme, axes.get_legend_handles_labels()[0], title=title)
-    foot(figure, theme, f"line: median; dots and bar: all {study.runs} runs; online: all sessions so far")
+    foot(figure, theme, f"line: median; dots and bar: {_all_runs(study)}; online: all sessions so far")
     return figure
+
+
+def _all_runs(study: SortingStudy) -> str:
+    return "the one run" if study.runs == 1 else f"all {study.runs} runs"
 
 
 def _at_counts(axes: Axes, study: SortingStudy) -> None:

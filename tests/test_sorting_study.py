@@ -200,6 +200,17 @@ def test_figures_show_what_was_measured(theme):
     assert ways.get_facecolor() == evd.get_facecolor()
 
 
+@pytest.mark.parametrize("plot", ["clusters_plot", "ways_found_plot", "ways_diagram"])
+def test_legend_and_small_print_of_a_single_method_fit_the_figure(plot):
+    study = small()
+    figure = getattr(sorting_figures, plot)(study._replace(results=study.results[:1]), LIGHT)
+    figure.draw_without_rendering()
+    whole = figure.bbox
+    for artist in [*figure.legends, figure._supxlabel]:
+        box = artist.get_window_extent()
+        assert whole.x0 <= box.x0 < box.x1 <= whole.x1
+
+
 def test_command_writes_its_report(tmp_path):
     command = ["run", "sorting", "--trajectories", "6", "--runs", "1", "--method", "em-mlirl", "--steps"]
     command += ["20", "--belts", "10", "--json", "--report", str(tmp_path)]
