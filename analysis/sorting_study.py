@@ -13,20 +13,17 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ..domains.sorting import Sorting, demonstrate_sorting, sorting_with_claiming
 from ..inference.clustering import Clustering
 from ..inference.dpm import dpm_birl
 from ..inference.maximum_likelihood import em_mlirl
-from ..inference.mtirl import DEFAULT_RESTARTS, DEFAULT_WAYS, batch_mme_mtirl, mme_mtirl
+from ..inference.mtirl import DEFAULT_RESTARTS, DEFAULT_WAYS, assign_trajectories, batch_mme_mtirl, mme_mtirl
 from ..inference.session import Learner
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
-from ..models.planning import reward_of, soft_plan
 from .multi_task_metrics import (
     adjusted_rand_index,
     assignment_accuracy,
@@ -372,33 +369,10 @@ def _explained(
     """All trajectories so far under what an online learner knows now; it has kept none of them."""
     proportions = np.asarray(state.proportions)
     present = np.argsort(-proportions, kind="stable")[: np.count_nonzero(proportions)]
-    padded = demonstration.bucketed()
-    joint = np.asarray(
-        _joint(mdp, state.weights, state.proportions, jnp.asarray(padded.state), jnp.asarray(padded.action))
-    )[: demonstration.n_trajectories, present]
-    shares = np.exp(joint - joint.max(1, keepdims=True))
-    shares /= shares.sum(1, keepdims=True)
+    shares = assign_trajectories(mdp, None, state.weights, proportions, demonstration)[:, present]
     return Clustering(
-        np.asarray(state.weights)[present], proportions[present], shares, log_likelihood * len(joint)
+        np.asarray(state.weights)[present], proportions[present], shares, log_likelihood * len(shares)
     )
-
-
-@jax.jit
-def _joint(
-    mdp: TabularMDP,
-    weights: Float[Array, "D K"],
-    proportions: Float[Array, " D"],
-    states: Int[Array, "n L"],
-    actions: Int[Array, "n L"],
-) -> Float[Array, "n D"]:
-    """``log pi_d + log P(X_i; theta_d)``, dynamics left out; steps of padding have no action."""
-    real = actions >= 0
-
-    def one(weights: Float[Array, " K"]) -> Float[Array, " n"]:
-        steps = soft_plan(mdp, reward_of(mdp, weights)).log_policy[states, actions]
-        return jnp.sum(jnp.where(real, steps, 0.0), axis=1)
-
-    return jnp.log(proportions) + lax.map(one, weights).T
 
 
 def _judged(

@@ -9,7 +9,7 @@ The sound form of program (5.1). Given trajectories and, online, what is kept of
 
 (``n_d``, ``N_d``: mass and visits kept of earlier sessions). The E-step makes ``v_{d,i}`` proportional to
 ``pi_d P(X_i; theta_d)^(1/price)``; the M-steps are :func:`~.entropic.entropic_proportions` and one
-maximum-entropy program per way (:func:`~.maxent.fit_counts`). ``J`` never falls.
+maximum-entropy program per way (:func:`~.maxent.fit_counts`). ``J`` never falls while the ways stay the same.
 
 *How many ways.* With ``price`` 1, ``J`` is the likelihood of a mixture, and that cannot tell a sorter who
 flips a coin once and then sticks to it from two sorters who know what they want: the first costs ``log 2``

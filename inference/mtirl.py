@@ -337,8 +337,10 @@ def _program(
 ) -> MixtureProgram:
     require_discounted(mdp)
     for name, number in (("ways", ways), ("restarts", restarts), ("iterations", iterations)):
-        if number < 1:
+        if not number >= 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
+        if number != int(number):
+            raise ValueError(f"{name} must be a whole number, got {number}")
     for name, value in (("strength", strength), ("price", price), ("l1", l1), ("ridge", ridge)):
         if not 0 <= value < float("inf"):
             raise ValueError(f"{name} must be finite and not negative, got {value}")

@@ -206,7 +206,7 @@ class LearningErrorChange:
         """Whether to stop after the last report."""
         if len(reports) < 2:
             return False
-        before, after = (float(self._error(jnp.asarray(r.weights))) for r in reports[-2:])
+        before, after = (float(self._error(_one_reward(r))) for r in reports[-2:])
         return before - after <= self.rho
 
 
@@ -260,8 +260,18 @@ class PolicyWindow:
         """Whether to stop after the last report."""
         if len(reports) < self.width:
             return False
-        actions = np.asarray(self._actions(np.stack([r.weights for r in reports[-self.width :]])))
+        actions = np.asarray(self._actions(np.stack([_one_reward(r) for r in reports[-self.width :]])))
         return float((actions != actions[-1]).mean(axis=1).max()) <= self.tolerance
+
+
+def _one_reward(report: Report) -> Float[np.ndarray, " K"]:
+    weights = np.asarray(report.weights)
+    if weights.ndim != 1:
+        raise ValueError(
+            f"this criterion compares one reward with the next; the learner has {len(weights)} at a time: "
+            "use LikelihoodChange or MovingWindow"
+        )
+    return weights
 
 
 # -- running ------------------------------------------------------------------------------------------

@@ -201,6 +201,7 @@ def test_streams_whose_first_session_is_empty_learn_from_the_next(sorting):
     ("options", "message"),
     [
         ({"ways": 0}, "ways must be at least 1, got 0"),
+        ({"ways": 2.5}, "ways must be a whole number, got 2.5"),
         ({"price": 0.0}, "price must be more than zero"),
         ({"ridge": -1.0}, "ridge must be finite and not negative"),
         ({"strength": float("nan")}, "strength must be finite and not negative, got nan"),

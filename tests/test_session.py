@@ -7,6 +7,7 @@ from i2rl.inference import (
     LearningErrorChange,
     LikelihoodChange,
     MovingWindow,
+    PolicyWindow,
     Report,
     average_regret,
     fleet,
@@ -50,6 +51,14 @@ def test_criterion_one_stops_when_the_likelihood_settles():
     assert not stop([report(1, -3.0)])
     assert not stop([report(1, -3.0), report(2, -2.0)])
     assert stop([report(1, -3.0), report(2, -2.0), report(3, -2.05)])
+
+
+def test_criteria_about_one_reward_refuse_several(random_mdp):
+    several = [report(i, weights=np.ones((3, 2))) for i in (1, 2)]
+    mdp = random_mdp(1, n_features=2)
+    for stop in (LearningErrorChange(1e-6, mdp, np.ones(2)), PolicyWindow(2, 0.0, mdp)):
+        with pytest.raises(ValueError, match="the learner has 3 at a time"):
+            stop(several)
 
 
 def test_criterion_two_stops_when_the_learning_error_settles(random_mdp):
