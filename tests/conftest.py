@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -18,6 +19,19 @@ from i2rl.models.planning import simulate
 
 settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=25, database=None)
 settings.load_profile("deterministic")
+
+
+# Linux lets a process map 65,530 regions of memory and ends it where a compiler asks for more.
+_MANY_REGIONS = 20_000
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _compiled_programs_are_let_go():
+    """Every compiled program takes some regions, and a worker runs many modules."""
+    yield
+    regions = Path("/proc/self/maps")
+    if regions.exists() and len(regions.read_text().splitlines()) > _MANY_REGIONS:
+        jax.clear_caches()
 
 
 def _random_mdp(
