@@ -16,7 +16,15 @@ from .demonstration import (
     read_trajectories,
     write_trajectories,
 )
-from .evidence import Imperfection, ObservationModel, Sensor, Visibility, log_evidence, require_possible
+from .evidence import (
+    FeatureNoise,
+    Imperfection,
+    ObservationModel,
+    Sensor,
+    Visibility,
+    log_evidence,
+    require_possible,
+)
 from .mdp import TabularMDP
 from .mixture import MixtureLaw, mixture_model, stick_proportions, truncation_error
 from .occlusion import occlusion_model, weights_prior
@@ -45,6 +53,7 @@ from .trajectory import TrajectoryLaw, sample_demonstration
 __all__ = [
     "Demonstration",
     "DemonstrationError",
+    "FeatureNoise",
     "FinitePlan",
     "HardPlan",
     "Imperfection",

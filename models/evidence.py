@@ -160,6 +160,109 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
         return flat // n_actions, flat % n_actions
 
 
+class _NoiseFields(NamedTuple):
+    predicates: Bool[Array, "J S A"]
+    reliabilities: Float[Array, " J"]
+    reportable: Bool[Array, "S A"]
+
+
+class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
+    """Noise on features of a pair (6.1): ``O(o | g)`` by the predicates that ``o`` and ``g`` agree on.
+
+    ``O(o | g) = prod_j p_j^[psi_j(o) = psi_j(g)] (1 - p_j)^[psi_j(o) != psi_j(g)] / Z(g)``, normalised over
+    the pairs ``o`` that can be reported; Eq. 6.5 is that without ``Z``. A reliability ``p_j`` is a parameter,
+    not a frequency: how often a predicate is reported rightly is :meth:`agreement`.
+
+    Parameters
+    ----------
+    predicates : bool ``[J, S, A]``
+        ``psi_j(s, a)``.
+    reliabilities : float ``[J]``
+        ``p_j``, between 0 and 1; one half says nothing about its predicate.
+    reportable : bool ``[S, A]``, optional
+        Which pairs perception may report; all of them by default, unavailable ones too: perception does not
+        know the task.
+
+    Raises
+    ------
+    ValueError
+        For predicates that are not true or false, reliabilities outside (0, 1), or shapes that do not fit.
+    """
+
+    __slots__ = ()
+
+    def __new__(
+        cls,
+        predicates: np.ndarray | Array,
+        reliabilities: np.ndarray | Array,
+        reportable: np.ndarray | Array | None = None,
+    ) -> FeatureNoise:
+        """Check and convert; see the class."""
+        if reportable is None:
+            reportable = np.ones(np.shape(predicates)[1:], bool)
+        # Only what a user would write is checked: JAX rebuilds this tuple around its own placeholders.
+        if isinstance(predicates, np.ndarray | list | tuple):
+            predicates = jnp.asarray(_checked_predicates(predicates))
+        if isinstance(reliabilities, np.ndarray | list | tuple):
+            p = np.asarray(reliabilities, dtype=float)
+            if p.shape != predicates.shape[:1]:
+                raise ValueError(
+                    f"{predicates.shape[0]} predicates need as many reliabilities, got shape {list(p.shape)}"
+                )
+            if not ((p > 0) & (p < 1)).all():
+                j = int(np.flatnonzero(~((p > 0) & (p < 1)))[0])
+                raise ValueError(f"reliabilities lie between 0 and 1; that of predicate {j} is {p[j]}")
+            reliabilities = jnp.asarray(p)
+        if isinstance(reportable, np.ndarray | list | tuple):
+            mask = np.asarray(reportable, bool)
+            if mask.shape != predicates.shape[1:] or not mask.any():
+                raise ValueError(
+                    f"reportable must mark at least one of the pairs [S, A] = {list(predicates.shape[1:])}, "
+                    f"got shape {list(mask.shape)} with {mask.sum()} marked"
+                )
+            reportable = jnp.asarray(mask)
+        return super().__new__(cls, predicates, reliabilities, reportable)
+
+    @property
+    def presence(self) -> None:
+        """Noise hides nothing."""
+        return None
+
+    @property
+    def reading(self) -> ObservationModel:
+        """The normalised observation model, which also injects the noise."""
+        return ObservationModel(self.log_probabilities)
+
+    @property
+    def log_probabilities(self) -> Float[Array, "S A S A"]:
+        """``log O(o | g)``, truth first; ``-inf`` for what cannot be reported."""
+        n_predicates, *pairs = self.predicates.shape
+        psi = self.predicates.reshape(n_predicates, -1).astype(float)
+        logits = jnp.log(self.reliabilities) - jnp.log1p(-self.reliabilities)
+        # Up to a term that no o changes: sum_j logit_j [psi_j(o) = psi_j(g)].
+        both = (psi * logits[:, None]).T @ psi
+        neither = ((1 - psi) * logits[:, None]).T @ (1 - psi)
+        table = jnp.where(self.reportable.reshape(-1), both + neither, -jnp.inf)
+        return jax.nn.log_softmax(table, axis=1).reshape(*pairs, *pairs)
+
+    def agreement(self) -> Float[Array, "J S A"]:
+        """Probability that each predicate of a report is that of the truth ``(s, a)``."""
+        n_predicates, *pairs = self.predicates.shape
+        psi = self.predicates.reshape(n_predicates, -1).astype(float)
+        size = psi.shape[1]
+        true = psi @ jnp.exp(self.log_probabilities.reshape(size, size)).T
+        return jnp.where(self.predicates.reshape(n_predicates, -1), true, 1 - true).reshape(-1, *pairs)
+
+
+def _checked_predicates(predicates: np.ndarray | list | tuple) -> Bool[np.ndarray, "J S A"]:
+    psi = np.asarray(predicates)
+    if psi.ndim != 3 or not psi.size:
+        raise ValueError(f"predicates have shape [J, S, A], got {list(psi.shape)}")
+    if not np.isin(psi, (0, 1)).all():
+        raise ValueError("predicates are true or false at every pair")
+    return psi.astype(bool)
+
+
 def require_fitting(sensor: Imperfection, mdp: TabularMDP) -> None:
     """Raise ``ValueError`` if a sensor was made for another number of states or actions than the MDP has."""
     if sensor.presence is not None and sensor.presence.shape[-1:] != (mdp.n_states,):
