@@ -18,10 +18,10 @@ from typing import Any, NamedTuple
 import casadi as ca
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from scipy.sparse import csgraph
 
-from ..models.evidence import FeatureNoise
+from ..models.agreement import PredicateClasses, predicate_classes
 from .maxent_constraints import ProgramNotSolved
 from .maxent_dual import _COLD, _WARM, IpoptPoint
 
@@ -29,61 +29,6 @@ from .maxent_dual import _COLD, _WARM, IpoptPoint
 _FLAT = 1e-10
 # exp of less than this is zero: a row of the program would lose all its terms.
 _LEAST_EXPONENT = 700.0
-
-
-class PredicateClasses(NamedTuple):
-    """Pairs that no predicate tells apart, gathered: the program's cost is in classes, not in pairs.
-
-    Fields
-    ------
-    vectors : bool ``[C, J]``
-        Values of the predicates in each class.
-    reportable : float ``[C]``
-        How many pairs of each class perception may report.
-    of_pair : int ``[S, A]``
-        The class of each pair.
-    """
-
-    vectors: Bool[np.ndarray, "C J"]
-    reportable: Float[np.ndarray, " C"]
-    of_pair: Int[np.ndarray, "S A"]
-
-    @property
-    def agreements(self) -> Float[np.ndarray, "C C J"]:
-        """Whether each predicate of a truth (first) is that of a report (second)."""
-        return (self.vectors[:, None] == self.vectors[None]).astype(float)
-
-    def gather(self, weights: ArrayLike) -> Float[np.ndarray, " C"]:
-        """Weights of pairs ``[S, A]`` as weights of classes, of sum one; ``ValueError`` if they cannot."""
-        w = np.asarray(weights, float)
-        if w.shape != self.of_pair.shape:
-            raise ValueError(
-                f"weights of truths have shape [S, A] = {list(self.of_pair.shape)}, got {list(w.shape)}"
-            )
-        if not (np.isfinite(w) & (w >= 0)).all() or not w.sum() > 0:
-            raise ValueError(
-                f"weights of truths must be finite, not negative and not all zero; the least is {w.min()}, "
-                f"their sum {w.sum()}"
-            )
-        return np.bincount(self.of_pair.ravel(), w.ravel(), len(self.vectors)) / w.sum()
-
-
-def predicate_classes(predicates: ArrayLike, reportable: ArrayLike | None = None) -> PredicateClasses:
-    """Gather the pairs ``[S, A]`` by their predicates ``[J, S, A]``.
-
-    ``reportable [S, A]`` marks what perception may report; everything by default. Raises ``ValueError`` as
-    ``FeatureNoise`` does.
-    """
-    psi = np.asarray(predicates)
-    # One border for both: what can be learned is what can be injected.
-    mask = None if reportable is None else np.asarray(reportable)
-    noise = FeatureNoise(psi, np.full(psi.shape[:1], 0.5), mask)
-    psi, mask = np.asarray(noise.predicates), np.asarray(noise.reportable)
-    vectors, of_pair = np.unique(psi.reshape(len(psi), -1).T, axis=0, return_inverse=True)
-    of_pair = of_pair.reshape(psi.shape[1:])
-    return PredicateClasses(
-        vectors, np.bincount(of_pair[mask], minlength=len(vectors)).astype(float), of_pair
-    )
 
 
 class Identification(NamedTuple):
@@ -198,8 +143,9 @@ class ObservationProgram:
         minimise    sum_g w(g) log Z_g(lambda) - lambda.target + slack.(plus + minus),  lambda = plus - minus
         subject to  -limit <= lambda <= limit
 
-    Up to a factor it is minus the expected log-likelihood of the reports, if target and weights come from
-    one posterior over truths: maximum entropy is maximum likelihood here, as everywhere in this package.
+    Up to a factor it is minus the expected log-likelihood of the reports, if target and weights come from one
+    posterior over truths (:func:`~i2rl.models.agreement.reported_matches`): maximum entropy is maximum
+    likelihood here, as everywhere in this package.
 
     Parameters
     ----------
@@ -354,62 +300,3 @@ def _in_unit_interval(what: str, numbers: np.ndarray, n_predicates: int) -> Floa
         j = int(np.flatnonzero(outside)[0])
         raise ValueError(f"{what} of agreement lie between 0 and 1; that of predicate {j} is {numbers[j]}")
     return np.clip(numbers, 0, 1)
-
-
-class ReportedMatches(NamedTuple):
-    """What a posterior over truths says of the reports of a session.
-
-    Fields
-    ------
-    weights : float ``[S, A]``
-        How many reports each truth is expected to have had.
-    matches : float ``[J]``
-        On how many reports each predicate is expected to have been that of the truth.
-    """
-
-    weights: Float[np.ndarray, "S A"]
-    matches: Float[np.ndarray, " J"]
-
-    @property
-    def agreement(self) -> Float[np.ndarray, " J"]:
-        """The program's target: expected matches per report."""
-        return self.matches / self.weights.sum()
-
-
-def reported_matches(
-    predicates: ArrayLike,
-    states: ArrayLike,
-    actions: ArrayLike,
-    posterior: ArrayLike,
-) -> ReportedMatches:
-    """Count expected matches of reports with truths; counts of sessions add up.
-
-    Parameters
-    ----------
-    predicates : bool ``[J, S, A]``
-    states, actions : int ``[T]``
-        The pairs reported.
-    posterior : float ``[T, S, A]``
-        Of the truth behind each report. A point at the true pair gives the ``oracle`` of the sources, one at
-        the report itself ``observed``.
-
-    Raises ``ValueError`` for shapes that do not fit, indices out of range, or a posterior that is none.
-    """
-    psi, truth = np.asarray(predicates, bool), np.asarray(posterior, float)
-    s, a = np.asarray(states), np.asarray(actions)
-    if s.ndim != 1 or a.shape != s.shape or truth.shape != (len(s), *psi.shape[1:]):
-        raise ValueError(
-            f"{len(s) if s.ndim else 0} reports of pairs {list(psi.shape[1:])} need as many actions and a "
-            f"posterior [T, S, A]; got actions {list(a.shape)} and a posterior {list(truth.shape)}"
-        )
-    off = (s < 0) | (s >= psi.shape[1]) | (a < 0) | (a >= psi.shape[2])
-    if off.any():
-        t = int(np.flatnonzero(off)[0])
-        raise ValueError(f"report {t} is of the pair ({s[t]}, {a[t]}), outside {list(psi.shape[1:])}")
-    total = truth.sum((1, 2))
-    wrong = ~((truth >= 0).all((1, 2)) & (np.abs(total - 1) < 1e-6))
-    if wrong.any():
-        t = int(np.flatnonzero(wrong)[0])
-        raise ValueError(f"the posterior of report {t} is no distribution: it sums to {total[t]}")
-    true = np.einsum("tsa,jsa->tj", truth, psi.astype(float), optimize=True)
-    return ReportedMatches(truth.sum(0), np.where(psi[:, s, a].T, true, 1 - true).sum(0))

@@ -6,13 +6,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from i2rl.inference.observation_program import (
-    ObservationProgram,
-    predicate_classes,
-    reported_matches,
-    unidentified_predicates,
-)
+from i2rl.inference.observation_program import ObservationProgram, unidentified_predicates
 from i2rl.models import FeatureNoise
+from i2rl.models.agreement import predicate_classes, reported_matches
 
 
 def random_problem(seed, n_predicates=3, shape=(5, 3), hidden=0.0):
