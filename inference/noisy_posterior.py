@@ -1,0 +1,324 @@
+"""The posterior over reward weights and the reliabilities of perception together, as ArviZ ``InferenceData``.
+
+NUTS moves in weights and logits of reliabilities, with the truth behind every report summed out exactly.
+"""
+
+from __future__ import annotations
+
+import os
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import NamedTuple
+
+import arviz as az
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+from numpyro.infer import NUTS
+from numpyro.infer.hmc import HMCState
+from numpyro.infer.util import potential_energy
+from scipy import optimize
+
+from ..models.demonstration import Demonstration
+from ..models.evidence import FeatureNoise, Imperfection, Sensor, require_possible
+from ..models.mdp import TabularMDP
+from ..models.noisy_behaviour import noisy_behaviour_model, reliabilities_prior
+from ..models.planning import require_discounted
+from ..models.trajectory import TrajectoryLaw
+from ..version import __version__
+from .posterior import _MAX_STRETCH, Mode, _described, _fingerprint, gather
+
+
+class NoisyProblem(NamedTuple):
+    """Arguments of :func:`noisy_behaviour_model`, identical trajectories gathered."""
+
+    mdp: TabularMDP
+    predicates: Bool[Array, "J S A"]
+    reportable: Bool[Array, "S A"]
+    view: Sensor
+    codes: Int[Array, "u L 3"]
+    repeats: Int[Array, " u"]
+    prior: dist.Distribution
+    reliability_prior: dist.Distribution
+
+
+class NoisyChain(NamedTuple):
+    """One chain of NUTS.
+
+    Fields
+    ------
+    weights : float ``[draws, K]``
+    reliabilities : float ``[draws, J]``
+    lp : float ``[draws]``
+        Log-density of the unconstrained variables, up to the evidence.
+    energy, acceptance_rate, step_size : float ``[draws]``
+    n_steps : int ``[draws]``
+        Leapfrog steps.
+    diverging : bool ``[draws]``
+    """
+
+    weights: Float[Array, "draws K"]
+    reliabilities: Float[Array, "draws J"]
+    lp: Float[Array, " draws"]
+    energy: Float[Array, " draws"]
+    acceptance_rate: Float[Array, " draws"]
+    step_size: Float[Array, " draws"]
+    n_steps: Int[Array, " draws"]
+    diverging: Bool[Array, " draws"]
+
+
+def _apart(position: Float[Array, " D"], problem: NoisyProblem) -> dict[str, Array]:
+    n_reliabilities = problem.predicates.shape[0]
+    return {"weights": position[:-n_reliabilities], "reliabilities": position[-n_reliabilities:]}
+
+
+def _constrained(position: Float[Array, " D"], problem: NoisyProblem) -> dict[str, Array]:
+    supports = {"weights": problem.prior.support, "reliabilities": problem.reliability_prior.support}
+    return {name: dist.biject_to(supports[name])(x) for name, x in _apart(position, problem).items()}
+
+
+def noisy_potential(position: Float[Array, " D"], problem: NoisyProblem) -> Float[Array, ""]:
+    """Negative log-density of the declared model at unconstrained weights, then reliabilities."""
+    options = {
+        "view": problem.view,
+        "reportable": problem.reportable,
+        "prior": problem.prior,
+        "reliability_prior": problem.reliability_prior,
+        "repeats": problem.repeats,
+    }
+    arguments = (problem.mdp, problem.predicates, problem.codes)
+    return potential_energy(noisy_behaviour_model, arguments, options, _apart(position, problem))
+
+
+_potential_and_gradient = jax.jit(jax.value_and_grad(noisy_potential))
+
+
+def noisy_chain(
+    key: Array,
+    problem: NoisyProblem,
+    start: Float[Array, " D"],
+    inverse_mass: Float[Array, "D D"],
+    *,
+    warmup: int,
+    draws: int,
+    target_accept: float = 0.9,
+    max_tree_depth: int = 10,
+) -> NoisyChain:
+    """Run one chain of NUTS; traceable, so that chains and replications can be mapped over.
+
+    Starts at an unconstrained position with a dense ``inverse_mass``; both that matrix and the step size are
+    adapted during ``warmup``.
+    """
+    kernel = NUTS(
+        potential_fn=lambda z: noisy_potential(z, problem),
+        dense_mass=True,
+        inverse_mass_matrix=inverse_mass,
+        step_size=0.5,
+        target_accept_prob=target_accept,
+        max_tree_depth=max_tree_depth,
+    )
+
+    def advance(state: HMCState, _: None) -> tuple:
+        state = kernel.sample(state, (), {})
+        return state, NoisyChain(
+            **_constrained(state.z, problem),
+            lp=-state.potential_energy,
+            energy=state.energy,
+            acceptance_rate=state.accept_prob,
+            step_size=state.adapt_state.step_size,
+            n_steps=state.num_steps,
+            diverging=state.diverging,
+        )
+
+    state = kernel.init(key, warmup, start, (), {})
+    state, _ = lax.scan(lambda s, _: (advance(s, None)[0], None), state, None, warmup)
+    return lax.scan(advance, state, None, draws)[1]
+
+
+_run_chain = jax.jit(noisy_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
+
+
+def noisy_mode(problem: NoisyProblem) -> Mode:
+    """Climb (L-BFGS) from no weights and reliabilities a little above one half, and measure the curvature.
+
+    Only a place to start from: where sloppy experts and sloppy sensors explain the same, there are others.
+    """
+
+    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = _potential_and_gradient(x, problem)
+        return float(value), np.asarray(gradient)
+
+    sizes = [
+        dist.biject_to(prior.support).inverse_shape(prior.event_shape)[0]
+        for prior in (problem.prior, problem.reliability_prior)
+    ]
+    origin = np.concatenate([np.zeros(sizes[0]), np.full(sizes[1], 1.0)])
+    mode = optimize.minimize(objective, origin, jac=True, method="L-BFGS-B").x
+    offsets = 1e-4 * np.eye(len(mode))
+    curvature = np.stack([objective(mode + h)[1] - objective(mode - h)[1] for h in offsets]) / 2e-4
+    scales, axes = np.linalg.eigh((curvature + curvature.T) / 2)
+    scales = np.maximum(scales, max(scales.max() / _MAX_STRETCH**2, 1e-8))
+    return Mode(mode, (axes / scales) @ axes.T)
+
+
+@jax.jit
+def noisy_log_likelihood(
+    weights: Float[Array, "D K"], reliabilities: Float[Array, "D J"], problem: NoisyProblem
+) -> Float[Array, "D u"]:
+    """Log-likelihood of each distinct trajectory under every draw."""
+
+    def one(draw: tuple) -> Float[Array, " u"]:
+        sensor = FeatureNoise(problem.predicates, draw[1], problem.reportable) * problem.view
+        return TrajectoryLaw(problem.mdp, draw[0], sensor, problem.codes.shape[1]).log_prob(problem.codes)
+
+    # One draw at a time: linear solves do not batch, and evidence is [u, L, S, A] for each draw.
+    return lax.map(one, (weights, reliabilities))
+
+
+def noisy_problem(
+    mdp: TabularMDP,
+    predicates: ArrayLike,
+    demonstration: Demonstration,
+    *,
+    view: Imperfection | None = None,
+    reportable: ArrayLike | None = None,
+    prior: dist.Distribution | None = None,
+    reliability_prior: dist.Distribution | None = None,
+) -> tuple[NoisyProblem, Int[np.ndarray, " n"]]:
+    """The posterior's problem, checked, and the row that each trajectory became.
+
+    Raises as :func:`sample_noisy_posterior` does.
+    """
+    if demonstration.n_trajectories == 0:
+        raise ValueError("the demonstration has no trajectories; without data the posterior is the prior")
+    require_discounted(mdp)
+    psi = np.asarray(predicates)
+    noise = FeatureNoise(
+        psi, np.full(psi.shape[:1], 0.5), None if reportable is None else np.asarray(reportable)
+    )
+    seen = Sensor() if view is None else Sensor() * view
+    # What can be reported at all does not depend on how reliably.
+    require_possible(noise * seen, mdp, demonstration)
+    gathered, rows = gather(mdp, seen, demonstration, prior)
+    return (
+        NoisyProblem(
+            mdp, noise.predicates, noise.reportable, seen, gathered.codes, gathered.repeats, gathered.prior,
+            reliabilities_prior(len(psi), reliability_prior),
+        ),
+        rows,
+    )  # fmt: skip
+
+
+def sample_noisy_posterior(
+    key: Array,
+    mdp: TabularMDP,
+    predicates: ArrayLike,
+    demonstration: Demonstration,
+    *,
+    view: Imperfection | None = None,
+    reportable: ArrayLike | None = None,
+    prior: dist.Distribution | None = None,
+    reliability_prior: dist.Distribution | None = None,
+    names: tuple[str, ...] | None = None,
+    draws: int = 500,
+    warmup: int = 300,
+    chains: int = 4,
+    target_accept: float = 0.9,
+    max_tree_depth: int = 10,
+) -> az.InferenceData:
+    """Draw from the joint posterior over weights and reliabilities of :func:`noisy_behaviour_model`.
+
+    Chains start around a mode, dispersed twice as widely as its curvature suggests, and run in as many
+    threads as there are processors. The same key gives the same draws.
+
+    Parameters
+    ----------
+    key : JAX random key
+    mdp, predicates, demonstration, view, reportable, prior, reliability_prior
+        Of the model. Scores play no part.
+    names : tuple of str, optional
+        Of the predicates; ``psi1``, ``psi2``, ... by default.
+    draws, warmup, chains : int
+        Draws kept and discarded by each chain, and number of chains.
+    target_accept, max_tree_depth
+        As in NumPyro's ``NUTS``.
+
+    Returns
+    -------
+    arviz.InferenceData
+        ``posterior``: ``weights (chain, draw, feature)``, ``reliabilities (chain, draw, predicate)``.
+        ``log_likelihood``: ``demonstration (chain, draw, trajectory)``.
+        ``sample_stats``: ``lp``, ``energy``, ``acceptance_rate``, ``step_size``, ``n_steps``, ``diverging``.
+        ``observed_data``: ``kind``, ``state``, ``action (trajectory, step)``.
+
+    Raises
+    ------
+    DemonstrationError
+        Naming trajectory and step, if no truth could give an observation.
+    ValueError
+        For an empty demonstration, predicates, priors or names that do not fit, numbers of draws or chains
+        below one, or an undiscounted MDP.
+    """
+    for name, number, least in (("draws", draws, 1), ("chains", chains, 1), ("warmup", warmup, 0)):
+        if number < least:
+            raise ValueError(f"{name} must be at least {least}, got {number}")
+    problem, rows = noisy_problem(
+        mdp, predicates, demonstration, view=view, reportable=reportable, prior=prior,
+        reliability_prior=reliability_prior,
+    )  # fmt: skip
+    n_predicates = problem.predicates.shape[0]
+    names = tuple(f"psi{j + 1}" for j in range(n_predicates)) if names is None else names
+    if len(names) != n_predicates:
+        raise ValueError(f"there is one name for each of {n_predicates} predicates, got {list(names)}")
+    mode = noisy_mode(problem)
+    start_key, chain_key = jax.random.split(key)
+    spread = 2.0 * np.linalg.cholesky(mode.covariance)
+    starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
+    run = partial(
+        _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
+    )
+    # Threads rather than vmap: mapped chains wait for the longest tree, and the solves do not batch.
+    with ThreadPoolExecutor(min(chains, os.cpu_count() or 1)) as pool:
+        jobs = [
+            pool.submit(lambda k, x: jax.block_until_ready(run(k, problem, x, mode.covariance)), k, x)
+            for k, x in zip(jax.random.split(chain_key, chains), starts, strict=True)
+        ]
+        chain: NoisyChain = jax.tree.map(lambda *xs: np.stack(xs), *[job.result() for job in jobs])
+    flat = (jnp.asarray(x.reshape(chains * draws, -1)) for x in (chain.weights, chain.reliabilities))
+    log_likelihood = np.asarray(noisy_log_likelihood(*flat, problem))[:, rows].reshape(chains, draws, -1)
+    steps = ["trajectory", "step"]
+    attrs = {
+        "inference_library": "numpyro",
+        "inference_library_version": numpyro.__version__,
+        "i2rl_version": __version__,
+        "inference": "NUTS over weights and reliabilities, truths summed out",
+        "mdp_fingerprint": mdp.fingerprint(),
+        "predicates_fingerprint": _fingerprint((problem.predicates, problem.reportable)),
+        "sensor_fingerprint": _fingerprint(problem.view),
+        "prior": _described(problem.prior),
+        "reliability_prior": _described(problem.reliability_prior),
+        "key": str(np.asarray(jax.random.key_data(key)).tolist()),
+    }
+    return az.from_dict(
+        posterior={"weights": chain.weights, "reliabilities": chain.reliabilities},
+        sample_stats={
+            field: getattr(chain, field)
+            for field in ("lp", "energy", "acceptance_rate", "step_size", "n_steps", "diverging")
+        },
+        log_likelihood={"demonstration": log_likelihood},
+        observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},
+        coords={"predicate": list(names), "feature": np.arange(mdp.n_features)},
+        dims={
+            "weights": ["feature"],
+            "reliabilities": ["predicate"],
+            "demonstration": ["trajectory"],
+            **dict.fromkeys(("kind", "state", "action"), steps),
+        },
+        attrs=attrs,
+        posterior_attrs=attrs,
+    )

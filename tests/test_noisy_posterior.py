@@ -1,0 +1,84 @@
+"""The joint posterior over weights and reliabilities: against quadrature, and at its borders."""
+
+import arviz as az
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+import pytest
+
+from i2rl.inference.noisy_posterior import noisy_log_likelihood, noisy_problem, sample_noisy_posterior
+from i2rl.models import (
+    Demonstration,
+    DemonstrationError,
+    FeatureNoise,
+    TrajectoryLaw,
+    Visibility,
+    sample_demonstration,
+)
+from i2rl.models.demonstration import SEEN
+
+PREDICATES = np.array([[[1, 0], [1, 1], [0, 1]]], bool)
+VIEW = np.array([1.0, 0.4, 0.8])
+
+
+@pytest.fixture(scope="module")
+def toy(random_mdp):
+    return random_mdp(3, n_states=3, n_actions=2, n_successors=2, n_features=1)
+
+
+@pytest.fixture(scope="module")
+def demonstration(toy):
+    sensor = FeatureNoise(PREDICATES, np.array([0.85])) * Visibility(VIEW)
+    law = TrajectoryLaw(toy, jnp.array([3.0]), sensor, 4)
+    return sample_demonstration(jax.random.key(1), law, 40)
+
+
+def test_the_posterior_is_that_of_quadrature(toy, demonstration):
+    priors = {"prior": dist.Normal(0.0, 2.0), "reliability_prior": dist.Beta(3.0, 1.5)}
+    drawn = sample_noisy_posterior(
+        jax.random.key(0), toy, PREDICATES, demonstration, view=Visibility(VIEW), names=("edge",),
+        chains=2, draws=600, **priors,
+    )  # fmt: skip
+    assert drawn.posterior.predicate.values.tolist() == ["edge"]
+    problem, rows = noisy_problem(toy, PREDICATES, demonstration, view=Visibility(VIEW))
+    theta, p = (x.ravel() for x in np.meshgrid(np.linspace(-8, 12, 61), (np.arange(60) + 0.5) / 60))
+    likelihood = noisy_log_likelihood(jnp.asarray(theta[:, None]), jnp.asarray(p[:, None]), problem)
+    log_posterior = np.asarray(likelihood)[:, rows].sum(1)
+    log_posterior += -((theta / 2) ** 2) / 2 + 2 * np.log(p) + 0.5 * np.log(1 - p)
+    weight = np.exp(log_posterior - log_posterior.max())
+    weight /= weight.sum()
+    error = az.mcse(drawn, method="mean")
+    for name, grid in (("weights", theta), ("reliabilities", p)):
+        x = drawn.posterior[name]
+        mean = weight @ grid
+        assert abs(float(x.mean()) - mean) < 4 * float(error[name][0]) + 1e-3
+        np.testing.assert_allclose(float(x.std()), np.sqrt(weight @ (grid - mean) ** 2), rtol=0.15)
+    # What the InferenceData says of each trajectory is the law's own log-probability.
+    at = {name: drawn.posterior[name][0, 5].values for name in ("weights", "reliabilities")}
+    sensor = FeatureNoise(PREDICATES, at["reliabilities"]) * Visibility(VIEW)
+    law = TrajectoryLaw(toy, jnp.asarray(at["weights"]), sensor, 4)
+    np.testing.assert_allclose(
+        drawn.log_likelihood.demonstration[0, 5], law.log_prob(jnp.asarray(demonstration.codes)), atol=1e-10
+    )
+
+
+def test_bad_input_is_refused_in_its_own_terms(toy, demonstration):
+    def sample(demonstration=demonstration, predicates=PREDICATES, **options):
+        sample_noisy_posterior(
+            jax.random.key(0), toy, predicates, demonstration, view=Visibility(VIEW), **options
+        )
+
+    with pytest.raises(ValueError, match="chains must be at least 1"):
+        sample(chains=0)
+    with pytest.raises(ValueError, match="observation model is about"):
+        sample(predicates=PREDICATES[:, :2])
+    with pytest.raises(ValueError, match="there is one name for each of 1 predicates"):
+        sample(names=("one", "two"))
+    with pytest.raises(ValueError, match="admits others"):
+        sample(reliability_prior=dist.Normal(0.0, 1.0))
+    mute = np.ones((3, 2), bool)
+    mute[1, 1] = False
+    told = Demonstration.from_codes(np.array([[[SEEN, 0, 0], [SEEN, 1, 1]]], np.int32))
+    with pytest.raises(DemonstrationError, match="trajectory 0, step 1: impossible observation"):
+        sample(told, reportable=mute)
