@@ -41,9 +41,10 @@ def observation_feature_model(
     combination of predicates is reportable and equally common, :math:`p_j` is also how often predicate
     :math:`j` is right, and the posterior is ``Beta(a + matches, b + reports - matches)``.
 
-    A score is perception's confidence that its report is right. If it is calibrated, its mean is the
-    probability ``mu(p)`` that a report agrees with its truth on every predicate:
-    ``c_t ~ Beta(kappa mu, kappa (1 - mu))``, ``kappa ~ Exponential(mean 10)``.
+    A score ``c_t`` is perception's calibrated confidence that its report is right, in agreement with its
+    truth on every predicate. The model gives that the probability ``mu(p)``, averaged over truths, and hears
+    the expectation ``sum_t c_t log mu + (1 - c_t) log(1 - mu)``. It is greatest where ``mu`` is the mean
+    score, as Eq. 6.6 has it, however scores are spread.
 
     Parameters
     ----------
@@ -51,8 +52,7 @@ def observation_feature_model(
     reported : ReportedMatches
         Of all sessions so far; their counts add up.
     scores : float ``[n]``, optional
-        In [0, 1]; NaN where perception gave none. Without scores ``kappa`` and ``score`` are not in the
-        model.
+        In [0, 1]; NaN where perception gave none. Without scores ``score`` is not in the model.
     reportable : bool ``[S, A]``, optional
         Which pairs perception may report; all by default.
     prior : pair of float or float ``[J]``
@@ -63,9 +63,9 @@ def observation_feature_model(
     Returns
     -------
     pymc.Model
-        Free variables ``reliability (predicate)`` and, with scores, ``concentration``; deterministic
-        ``agreement (predicate)``, the probability that a predicate is reported rightly, averaged over the
-        truths; observed ``matches (predicate)`` and ``score (report)``.
+        Free variable ``reliability (predicate)``; deterministic ``agreement (predicate)``, the probability
+        that a predicate is reported rightly, averaged over the truths; observed ``matches (predicate)`` and
+        ``score (report)``.
 
     Raises
     ------
@@ -109,14 +109,7 @@ def observation_feature_model(
         )
         if len(known):
             right = pt.dot(share, pt.exp(own + pt.sum(logits) - log_z))
-            concentration = pm.Exponential("concentration", scale=10.0)
-            pm.Beta(
-                "score",
-                alpha=concentration * right,
-                beta=concentration * (1 - right),
-                observed=known,
-                dims="report",
-            )
+            pm.CustomDist("score", right, logp=_log_confidence, observed=known, dims="report")
     return model
 
 
@@ -148,8 +141,8 @@ def sample_observation_features(
     Returns
     -------
     arviz.InferenceData
-        ``posterior``: ``reliability``, ``agreement (chain, draw, predicate)`` and, with scores,
-        ``concentration (chain, draw)``; ``sample_stats``; ``observed_data``: ``matches``, ``score``.
+        ``posterior``: ``reliability``, ``agreement (chain, draw, predicate)``; ``sample_stats``;
+        ``observed_data``: ``matches``, ``score``.
 
     Raises ``ValueError`` as the model does, and for numbers of draws or chains below one.
     """
@@ -175,6 +168,10 @@ def sample_observation_features(
 
 def _log_likelihood(matches: pt.TensorVariable, logits: pt.TensorVariable, log_z: pt.TensorVariable) -> Any:
     return pt.dot(logits, matches) - log_z
+
+
+def _log_confidence(scores: pt.TensorVariable, right: pt.TensorVariable) -> Any:
+    return scores * pt.log(right) + (1 - scores) * pt.log1p(-right)
 
 
 def _checked_matches(
@@ -208,7 +205,7 @@ def _checked_names(names: tuple[str, ...] | None, n_predicates: int) -> tuple[st
 
 
 def _checked_scores(scores: ArrayLike | None) -> Float[np.ndarray, " n"]:
-    """Scores that were given, moved off 0 and 1, where a Beta density has no finite value."""
+    """Scores that were given."""
     c = np.zeros(0) if scores is None else np.asarray(scores, float)
     if c.ndim != 1:
         raise ValueError(f"scores have shape [n], one for each report, got {list(c.shape)}")
@@ -216,6 +213,4 @@ def _checked_scores(scores: ArrayLike | None) -> Float[np.ndarray, " n"]:
     if wrong.any():
         t = int(np.flatnonzero(wrong)[0])
         raise ValueError(f"scores lie between 0 and 1; that of report {t} is {c[t]}")
-    known = c[~np.isnan(c)]
-    # Smithson and Verkuilen (2006): their squeeze vanishes as scores grow many.
-    return (known * (len(known) - 1) + 0.5) / max(len(known), 1)
+    return c[~np.isnan(c)]
