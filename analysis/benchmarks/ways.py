@@ -14,6 +14,7 @@ How many ways are found, value differences and run times beside the baselines: `
 from __future__ import annotations
 
 import argparse
+import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
@@ -23,12 +24,13 @@ import numpy as np
 from jaxtyping import Int
 
 from ...domains.sorting import MixedDemonstration, Sorting, demonstrate_sorting, sorting_with_claiming
-from ...inference.mtirl import assign_trajectories, batch_mme_mtirl, mme_mtirl
+from ...inference.clustering import Clustering
+from ...inference.mtirl import BatchMixture, assign_trajectories, batch_mme_mtirl, mme_mtirl
 from ...inference.session import Learner
 from ...models import Demonstration, Sensor, TrajectoryLaw, Visibility, concatenate
 from ...models.demonstration import HIDDEN, UNKNOWN
 from ..multi_task_metrics import adjusted_rand_index, assignment_accuracy, expected_value_difference
-from .harness import print_table, publish, seconds
+from .harness import print_table, publish
 
 STEPS = 50
 
@@ -50,6 +52,22 @@ def run_online(
     return state, reports
 
 
+def rerun(
+    batch: BatchMixture, key: jax.Array, demonstration: Demonstration, ends: Sequence[int]
+) -> Clustering:
+    """Fit the batch learner to everything so far at every end; the last fit."""
+    for end in ends:
+        fit = batch.fit(key, demonstration.select(slice(0, end)))
+    return fit
+
+
+def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
+    """Wall-clock seconds of a call, and what it returned."""
+    began = time.perf_counter()
+    result = function(*arguments)
+    return time.perf_counter() - began, result
+
+
 def online_against_batch(
     sorting: Sorting, tasks: int, n: int, size: int, seeds: Sequence[int]
 ) -> list[dict[str, Any]]:
@@ -60,18 +78,11 @@ def online_against_batch(
         key = jax.random.key(seed)
         mixed = shuffled(key, demonstrate_sorting(key, sorting, [n // tasks] * tasks, STEPS))
         demonstration, labels = mixed
-        ends = [len(labels[: i + size]) for i in range(0, len(labels), size)]
+        ends = [min(i + size, len(labels)) for i in range(0, len(labels), size)]
         result: dict[str, Any] = {"tasks": tasks, "n": n, "seed": seed}
 
-        def stream() -> None:
-            result["state"] = run_online(online, key, demonstration, size)[0]  # noqa: B023
-
-        def again() -> None:
-            for end in ends:  # noqa: B023
-                result["fit"] = batch.fit(key, demonstration.select(slice(0, end)))  # noqa: B023
-
-        result["online_seconds"], result["batch_seconds"] = seconds(stream), seconds(again)
-        state, fit = result.pop("state"), result.pop("fit")
+        result["online_seconds"], (state, _) = timed(run_online, online, key, demonstration, size)
+        result["batch_seconds"], fit = timed(rerun, batch, key, demonstration, ends)
         present = np.asarray(state.proportions) > 0
         weights = np.asarray(state.weights)[present]
         shares = assign_trajectories(
@@ -141,9 +152,7 @@ def hidden_steps(
         key = jax.random.key(seed)
         whole, labels = demonstrate_sorting(key, sorting, [n // tasks] * tasks, STEPS)
         seen = hide(jax.random.fold_in(key, 1), whole, share)
-        found: list[Any] = []
-        took = seconds(lambda: found.append(batch.fit(key, seen)))  # noqa: B023
-        fit = found[0]
+        took, fit = timed(batch.fit, key, seen)
         records.append({
             "seed": seed, "ways": fit.n_clusters, "seconds": took,
             "accuracy": assignment_accuracy(labels, fit.assignments),
@@ -185,16 +194,16 @@ def main() -> None:
     seeds, sorting = range(options.seeds), sorting_with_claiming()
     results: dict[str, Any] = {}
 
-    def record(name: str, runs: Callable[[], list[dict[str, Any]]]) -> list[dict[str, Any]]:
-        results[name] = runs()
+    def record(name: str, runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
+        results[name] = runs
         publish("ways", results)
-        return results[name]
+        return runs
 
     rows: list[tuple[Any, ...]] = []
     for tasks, n, size in ((2, 64, 4), (2, 128, 8), (3, 96, 6), (3, 192, 12)):
         runs = record(
             f"online, {tasks} tasks, n = {n}",
-            lambda: online_against_batch(sorting, tasks, n, size, seeds[:10]),  # noqa: B023
+            online_against_batch(sorting, tasks, n, size, seeds[:10]),
         )
         column = {name: np.array([run[name] for run in runs]) for name in runs[0]}
         rows.append((
@@ -207,7 +216,7 @@ def main() -> None:
     columns = ("stream", "all ways found, online / batch", "EVD online", "EVD batch", "s online", "s batch")
     print_table("Online against batch at every session", (*columns, "ratio"), rows)
 
-    runs = record("late", lambda: late_way(sorting, 18, 6, seeds))
+    runs = record("late", late_way(sorting, 18, 6, seeds))
     print_table(
         "A third way from the last third of 18 sessions of 6 on",
         ("two before", "three after", "mean accuracy", "mean EVD"),
@@ -221,7 +230,7 @@ def main() -> None:
     for tasks, n in ((2, 64), (3, 96)):
         runs = record(
             f"hidden, {tasks} tasks",
-            lambda: hidden_steps(sorting, tasks, n, 0.5, seeds[:10]),  # noqa: B023
+            hidden_steps(sorting, tasks, n, 0.5, seeds[:10]),
         )
         rows.append((
             f"{tasks} tasks, {n}", f"{sum(run['ways'] == tasks for run in runs)} of {len(runs)}",
@@ -238,7 +247,7 @@ def main() -> None:
             for price in (0.5, 1.0):
                 runs = record(
                     f"soft, sharpness {sharpness:g}, {tasks} tasks, price {price:g}",
-                    lambda: soft_experts(sorting, sharpness, tasks, 64, price, seeds[:10]),  # noqa: B023
+                    soft_experts(sorting, sharpness, tasks, 64, price, seeds[:10]),
                 )
                 rows.append((
                     f"sharpness {sharpness:g}, {tasks} tasks, price {price:g}",
