@@ -1,0 +1,128 @@
+"""Chains of NUTS: where they start, how one runs, how several run at once.
+
+For densities over unconstrained sites. What sites mean, and what to report of them, is the caller's.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+from numpyro.infer import NUTS
+from numpyro.infer.hmc import HMCState
+from scipy import optimize
+
+# The metric NUTS starts from may stretch its longest axis this much over its shortest, no more: the
+# curvature at the mode says nothing about how far a prior with a kink or a saturated likelihood reaches.
+_MAX_STRETCH = 10.0
+
+Drawn = TypeVar("Drawn")
+
+
+class Transitions(NamedTuple):
+    """What NUTS did for each draw of a chain.
+
+    Fields
+    ------
+    lp : float ``[draws]``
+        Log-density of the unconstrained sites, up to the evidence.
+    energy, acceptance_rate, step_size : float ``[draws]``
+    n_steps : int ``[draws]``
+        Leapfrog steps.
+    diverging : bool ``[draws]``
+    """
+
+    lp: Float[Array, " draws"]
+    energy: Float[Array, " draws"]
+    acceptance_rate: Float[Array, " draws"]
+    step_size: Float[Array, " draws"]
+    n_steps: Int[Array, " draws"]
+    diverging: Bool[Array, " draws"]
+
+
+def run_nuts(
+    key: Array, kernel: NUTS, start: Any, constrain: Callable[[Any], Drawn], warmup: int, draws: int
+) -> tuple[Drawn, Transitions]:
+    """Run one chain of NUTS; traceable, so that chains and replications can be mapped over.
+
+    Parameters
+    ----------
+    key : JAX random key
+    kernel : numpyro.infer.NUTS
+        Made with a ``potential_fn``; a kernel for each call, since it remembers the one it was set up for.
+    start : array, or pytree of arrays
+        Unconstrained sites.
+    constrain : function
+        From unconstrained sites to what is kept of a draw, an array or a pytree of arrays; it is kept of
+        draws in ``warmup`` too, until the chain ends.
+    warmup, draws : int
+        Draws discarded, in which the kernel adapts, and draws kept.
+
+    Returns
+    -------
+    drawn : as ``constrain`` returns, with a leading axis ``[draws]``
+    transitions : Transitions
+    """
+
+    def advance(state: HMCState, _: None) -> tuple[HMCState, tuple[Drawn, Transitions]]:
+        state = kernel.sample(state, (), {})
+        return state, (
+            constrain(state.z),
+            Transitions(
+                lp=-state.potential_energy,
+                energy=state.energy,
+                acceptance_rate=state.accept_prob,
+                step_size=state.adapt_state.step_size,
+                n_steps=state.num_steps,
+                diverging=state.diverging,
+            ),
+        )
+
+    state = kernel.init(key, warmup, start, (), {})
+    # One scan, its beginning dropped: two would each trace and compile the whole sampler.
+    chain = lax.scan(advance, state, None, warmup + draws)[1]
+    return jax.tree.map(lambda x: x[warmup:], chain)
+
+
+def in_threads(run: Callable[..., Drawn], arguments: Sequence[tuple]) -> Drawn:
+    """Call ``run`` with each of ``arguments``, in as many threads as there are processors; results stacked.
+
+    Threads rather than ``vmap``: mapped chains would wait for the longest tree, and solves do not batch.
+    """
+    with ThreadPoolExecutor(min(len(arguments), os.cpu_count() or 1)) as pool:
+        jobs = [pool.submit(lambda xs: jax.block_until_ready(run(*xs)), xs) for xs in arguments]
+        return jax.tree.map(lambda *xs: np.stack(xs), *[job.result() for job in jobs])
+
+
+class Mode(NamedTuple):
+    """Where NUTS starts: the mode of the unconstrained density and a covariance from its curvature."""
+
+    position: Float[np.ndarray, " D"]
+    covariance: Float[np.ndarray, "D D"]
+
+
+def mode_of(
+    value_and_gradient: Callable[[np.ndarray], tuple[Any, Any]], origin: Float[np.ndarray, " D"]
+) -> Mode:
+    """Climb from ``origin`` to a mode (L-BFGS) and measure its curvature by differences of gradients.
+
+    ``value_and_gradient`` is of the negative log-density. The covariance is the inverse curvature, except
+    that no axis is longer than ten times the shortest: flatter or bent the other way, it is cut to that.
+    """
+
+    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, gradient = value_and_gradient(x)
+        return float(value), np.asarray(gradient)
+
+    mode = optimize.minimize(objective, origin, jac=True, method="L-BFGS-B").x
+    offsets = 1e-4 * np.eye(len(mode))
+    curvature = np.stack([objective(mode + h)[1] - objective(mode - h)[1] for h in offsets]) / 2e-4
+    scales, axes = np.linalg.eigh((curvature + curvature.T) / 2)
+    scales = np.maximum(scales, max(scales.max() / _MAX_STRETCH**2, 1e-8))
+    return Mode(mode, (axes / scales) @ axes.T)
