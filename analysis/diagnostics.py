@@ -6,9 +6,7 @@ Posteriors are those of :func:`~i2rl.inference.posterior.sample_posterior`: ``we
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from importlib.metadata import version
 from typing import Any
@@ -22,13 +20,14 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Array
 
+from ..inference.chains import in_threads
 from ..inference.posterior import (
     Chain,
     Problem,
     _described,
     _fingerprint,
+    _run_chain,
     gather,
-    nuts_chain,
     posterior_mode,
 )
 from ..models.demonstration import PAD, UNKNOWN, Demonstration
@@ -147,8 +146,6 @@ def _by_session(idata: az.InferenceData) -> tuple[str, ...]:
 
 # -- a posterior for each session ---------------------------------------------------------------------
 
-_run_chain = jax.jit(nuts_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
-
 
 def posterior_by_session(
     key: Array,
@@ -215,12 +212,8 @@ def posterior_by_session(
         starts = mode.position + 2.0 * away @ np.linalg.cholesky(mode.covariance).T
         keys = jax.random.split(chain_key, chains)
         jobs += [(k, part, x, mode.covariance) for k, x in zip(keys, starts, strict=True)]
-    with ThreadPoolExecutor(min(len(jobs), os.cpu_count() or 1)) as pool:
-        done = list(pool.map(lambda job: jax.block_until_ready(run(*job)), jobs))
-    by_session = [done[i : i + chains] for i in range(0, len(done), chains)]
     stacked: Chain = jax.tree.map(
-        lambda *xs: np.moveaxis(np.reshape(xs, (len(numbers), chains, *xs[0].shape)), 0, 2),
-        *[chain for group in by_session for chain in group],
+        lambda x: np.moveaxis(x.reshape(len(numbers), chains, *x.shape[1:]), 0, 2), in_threads(run, jobs)
     )
     configuration = {
         "draws": draws, "warmup": warmup, "chains": chains, "target_accept": target_accept,
@@ -235,9 +228,12 @@ def posterior_by_session(
         "sensor_fingerprint": _fingerprint(sensor),
         "prior": _described(problem.prior),
     }
-    statistics = {name: x for name, x in stacked._asdict().items() if name != "weights"}
-    statistics["tree_depth"] = np.floor(np.log2(np.maximum(stacked.n_steps, 1))).astype(int) + 1
-    statistics["reached_max_treedepth"] = stacked.n_steps >= 2**max_tree_depth - 1
+    n_steps = stacked.transitions.n_steps
+    statistics = {
+        **stacked.transitions._asdict(),
+        "tree_depth": np.floor(np.log2(np.maximum(n_steps, 1))).astype(int) + 1,
+        "reached_max_treedepth": n_steps >= 2**max_tree_depth - 1,
+    }
     return az.from_dict(
         posterior={"weights": stacked.weights},
         sample_stats=statistics,

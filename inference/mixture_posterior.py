@@ -14,21 +14,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
-from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float
 from numpyro.distributions import constraints
 from numpyro.infer import NUTS
-from numpyro.infer.hmc import HMCState
 
 from ..models.demonstration import Demonstration
 from ..models.evidence import Imperfection
 from ..models.mdp import TabularMDP
 from ..models.mixture import COMPONENTS, stick_proportions
+from .chains import Transitions, in_threads, run_nuts
 from .mixture_problem import (
     MixtureProblem,
     Position,
     Start,
-    in_threads,
     mixture_data,
     pose,
     potential,
@@ -40,19 +38,14 @@ from .mixture_problem import (
 class MixtureChain(NamedTuple):
     """One chain of NUTS.
 
-    ``weights [draws, T, K]``, ``proportions [draws, T]``, ``concentration [draws]``; the others, ``[draws]``,
-    are named as in :class:`.posterior.Chain`.
+    ``weights [draws, T, K]``, ``proportions [draws, T]``, ``concentration [draws]``, and what the sampler
+    did.
     """
 
     weights: Float[Array, "draws T K"]
     proportions: Float[Array, "draws T"]
     concentration: Float[Array, " draws"]
-    lp: Float[Array, " draws"]
-    energy: Float[Array, " draws"]
-    acceptance_rate: Float[Array, " draws"]
-    step_size: Float[Array, " draws"]
-    n_steps: Int[Array, " draws"]
-    diverging: Bool[Array, " draws"]
+    transitions: Transitions
 
 
 def nuts_mixture_chain(
@@ -72,26 +65,8 @@ def nuts_mixture_chain(
         target_accept_prob=target_accept,
         max_tree_depth=max_tree_depth,
     )
-
-    def advance(state: HMCState, _: None) -> tuple:
-        state = kernel.sample(state, (), {})
-        weights, proportions, concentration = constrained(state.z, problem)
-        return state, MixtureChain(
-            weights=weights,
-            proportions=proportions,
-            concentration=concentration,
-            lp=-state.potential_energy,
-            energy=state.energy,
-            acceptance_rate=state.accept_prob,
-            step_size=state.adapt_state.step_size,
-            n_steps=state.num_steps,
-            diverging=state.diverging,
-        )
-
-    state = kernel.init(key, warmup, start, (), {})
-    # One scan, its beginning dropped, compiles in half the time of two.
-    chain: MixtureChain = lax.scan(advance, state, None, warmup + draws)[1]
-    return jax.tree.map(lambda x: x[warmup:], chain)
+    drawn, transitions = run_nuts(key, kernel, start, lambda z: constrained(z, problem), warmup, draws)
+    return MixtureChain(*drawn, transitions)
 
 
 def constrained(position: Position, problem: MixtureProblem) -> tuple[Array, Array, Array]:
@@ -216,9 +191,13 @@ def sample_mixture_posterior(
     chain: MixtureChain = in_threads(run, [(k, problem, z) for k, z in zip(keys, begins, strict=True)])
     flat = [jnp.asarray(x.reshape(chains * draws, *x.shape[2:])) for x in chain[:3]]
     resolved = resolve_jit(jax.random.split(assign_key, chains * draws), *flat, problem)
-    depth = np.floor(np.log2(np.maximum(chain.n_steps, 1))).astype(int) + 1
-    stats = {name: getattr(chain, name) for name in MixtureChain._fields[3:]}
-    stats |= {"tree_depth": depth, "reached_max_treedepth": chain.n_steps >= 2**max_tree_depth - 1}
+    n_steps = chain.transitions.n_steps
+    depth = np.floor(np.log2(np.maximum(n_steps, 1))).astype(int) + 1
+    stats = {
+        **chain.transitions._asdict(),
+        "tree_depth": depth,
+        "reached_max_treedepth": n_steps >= 2**max_tree_depth - 1,
+    }
     method = "NUTS over weights and proportions, assignments and hidden steps summed out; exact assignments"
     drawn = tuple(np.asarray(x) for x in chain[:3])
     return mixture_data(key, problem, demonstration, present, drawn, resolved, stats, method)

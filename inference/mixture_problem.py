@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import arviz as az
 import jax
@@ -35,6 +33,7 @@ from ..models.mixture import (
 from ..models.occlusion import weights_prior
 from ..models.planning import require_discounted
 from ..version import __version__
+from .chains import in_threads as in_threads
 from .posterior import _described, _fingerprint
 
 # Chains start with at most this many ways: each costs a climb, and superfluous ones are given up in warmup.
@@ -224,13 +223,6 @@ def pose(
     prior = weights_prior(mdp.n_features, prior)
     alpha = concentration_prior(concentration)
     return MixtureProblem(mdp, sensor, perceived, jnp.asarray(rows), prior, alpha), demonstration, present
-
-
-def in_threads(run: Any, arguments: list[tuple]) -> Any:
-    """One chain a thread, stacked: mapped chains would wait for the longest tree, and solves do not batch."""
-    with ThreadPoolExecutor(min(len(arguments), os.cpu_count() or 1)) as pool:
-        jobs = [pool.submit(lambda xs: jax.block_until_ready(run(*xs)), xs) for xs in arguments]
-        return jax.tree.map(lambda *xs: np.stack(xs), *[job.result() for job in jobs])
 
 
 def mixture_data(

@@ -5,8 +5,6 @@ NUTS moves in weights and logits of reliabilities, with the truth behind every r
 
 from __future__ import annotations
 
-import os
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
 
@@ -20,9 +18,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 from numpyro.infer import NUTS
-from numpyro.infer.hmc import HMCState
 from numpyro.infer.util import potential_energy
-from scipy import optimize
 
 from ..models.demonstration import Demonstration
 from ..models.evidence import FeatureNoise, Imperfection, Sensor, require_possible
@@ -31,7 +27,8 @@ from ..models.noisy_behaviour import noisy_behaviour_model, reliabilities_prior
 from ..models.planning import require_discounted
 from ..models.trajectory import TrajectoryLaw
 from ..version import __version__
-from .posterior import _MAX_STRETCH, Mode, _described, _fingerprint, gather
+from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
+from .posterior import _described, _fingerprint, gather
 
 
 class NoisyProblem(NamedTuple):
@@ -48,28 +45,11 @@ class NoisyProblem(NamedTuple):
 
 
 class NoisyChain(NamedTuple):
-    """One chain of NUTS.
-
-    Fields
-    ------
-    weights : float ``[draws, K]``
-    reliabilities : float ``[draws, J]``
-    lp : float ``[draws]``
-        Log-density of the unconstrained variables, up to the evidence.
-    energy, acceptance_rate, step_size : float ``[draws]``
-    n_steps : int ``[draws]``
-        Leapfrog steps.
-    diverging : bool ``[draws]``
-    """
+    """One chain of NUTS: ``weights [draws, K]``, ``reliabilities [draws, J]`` and what the sampler did."""
 
     weights: Float[Array, "draws K"]
     reliabilities: Float[Array, "draws J"]
-    lp: Float[Array, " draws"]
-    energy: Float[Array, " draws"]
-    acceptance_rate: Float[Array, " draws"]
-    step_size: Float[Array, " draws"]
-    n_steps: Int[Array, " draws"]
-    diverging: Bool[Array, " draws"]
+    transitions: Transitions
 
 
 def _apart(position: Float[Array, " D"], problem: NoisyProblem) -> dict[str, Array]:
@@ -122,48 +102,25 @@ def noisy_chain(
         target_accept_prob=target_accept,
         max_tree_depth=max_tree_depth,
     )
-
-    def advance(state: HMCState, _: None) -> tuple:
-        state = kernel.sample(state, (), {})
-        return state, NoisyChain(
-            **_constrained(state.z, problem),
-            lp=-state.potential_energy,
-            energy=state.energy,
-            acceptance_rate=state.accept_prob,
-            step_size=state.adapt_state.step_size,
-            n_steps=state.num_steps,
-            diverging=state.diverging,
-        )
-
-    state = kernel.init(key, warmup, start, (), {})
-    state, _ = lax.scan(lambda s, _: (advance(s, None)[0], None), state, None, warmup)
-    return lax.scan(advance, state, None, draws)[1]
+    drawn, transitions = run_nuts(key, kernel, start, lambda z: _constrained(z, problem), warmup, draws)
+    return NoisyChain(**drawn, transitions=transitions)
 
 
 _run_chain = jax.jit(noisy_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
 
 
 def noisy_mode(problem: NoisyProblem) -> Mode:
-    """Climb (L-BFGS) from no weights and reliabilities a little above one half, and measure the curvature.
+    """A mode of the unconstrained density, from no weights and reliabilities a little above one half.
 
     Only a place to start from: where sloppy experts and sloppy sensors explain the same, there are others.
     """
-
-    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = _potential_and_gradient(x, problem)
-        return float(value), np.asarray(gradient)
 
     sizes = [
         dist.biject_to(prior.support).inverse_shape(prior.event_shape)[0]
         for prior in (problem.prior, problem.reliability_prior)
     ]
     origin = np.concatenate([np.zeros(sizes[0]), np.full(sizes[1], 1.0)])
-    mode = optimize.minimize(objective, origin, jac=True, method="L-BFGS-B").x
-    offsets = 1e-4 * np.eye(len(mode))
-    curvature = np.stack([objective(mode + h)[1] - objective(mode - h)[1] for h in offsets]) / 2e-4
-    scales, axes = np.linalg.eigh((curvature + curvature.T) / 2)
-    scales = np.maximum(scales, max(scales.max() / _MAX_STRETCH**2, 1e-8))
-    return Mode(mode, (axes / scales) @ axes.T)
+    return mode_of(lambda x: _potential_and_gradient(x, problem), origin)
 
 
 @jax.jit
@@ -282,13 +239,10 @@ def sample_noisy_posterior(
     run = partial(
         _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
     )
-    # Threads rather than vmap: mapped chains wait for the longest tree, and the solves do not batch.
-    with ThreadPoolExecutor(min(chains, os.cpu_count() or 1)) as pool:
-        jobs = [
-            pool.submit(lambda k, x: jax.block_until_ready(run(k, problem, x, mode.covariance)), k, x)
-            for k, x in zip(jax.random.split(chain_key, chains), starts, strict=True)
-        ]
-        chain: NoisyChain = jax.tree.map(lambda *xs: np.stack(xs), *[job.result() for job in jobs])
+    keys = jax.random.split(chain_key, chains)
+    chain: NoisyChain = in_threads(
+        run, [(k, problem, x, mode.covariance) for k, x in zip(keys, starts, strict=True)]
+    )
     flat = (jnp.asarray(x.reshape(chains * draws, -1)) for x in (chain.weights, chain.reliabilities))
     log_likelihood = np.asarray(noisy_log_likelihood(*flat, problem))[:, rows].reshape(chains, draws, -1)
     steps = ["trajectory", "step"]
@@ -306,10 +260,7 @@ def sample_noisy_posterior(
     }
     return az.from_dict(
         posterior={"weights": chain.weights, "reliabilities": chain.reliabilities},
-        sample_stats={
-            field: getattr(chain, field)
-            for field in ("lp", "energy", "acceptance_rate", "step_size", "n_steps", "diverging")
-        },
+        sample_stats=chain.transitions._asdict(),
         log_likelihood={"demonstration": log_likelihood},
         observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},
         coords={"predicate": list(names), "feature": np.arange(mdp.n_features)},

@@ -8,8 +8,6 @@ gets one joint completion of the demonstration by backward sampling. Together th
 from __future__ import annotations
 
 import hashlib
-import os
-from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import NamedTuple
 
@@ -23,9 +21,7 @@ import xarray as xr
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from numpyro.infer import NUTS
-from numpyro.infer.hmc import HMCState
 from numpyro.infer.util import potential_energy
-from scipy import optimize
 
 from ..models.chain import filter_forward, sample_backward
 from ..models.demonstration import PAD, UNKNOWN, Demonstration
@@ -34,11 +30,8 @@ from ..models.mdp import TabularMDP
 from ..models.occlusion import occlusion_model, weights_prior
 from ..models.planning import require_discounted, reward_of, soft_plan
 from ..version import __version__
+from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
 from .smoothing import Evidence, evidence_of, log_likelihoods
-
-# The metric NUTS starts from may stretch its longest axis this much over its shortest, no more: the
-# curvature at the mode says nothing about how far a prior with a kink or a saturated likelihood reaches.
-_MAX_STRETCH = 10.0
 
 
 class Problem(NamedTuple):
@@ -52,26 +45,15 @@ class Problem(NamedTuple):
 
 
 class Chain(NamedTuple):
-    """One chain of NUTS.
-
-    Fields
-    ------
-    weights : float ``[draws, K]``
-    lp : float ``[draws]``
-        Log-density of the unconstrained weights, up to the evidence.
-    energy, acceptance_rate, step_size : float ``[draws]``
-    n_steps : int ``[draws]``
-        Leapfrog steps.
-    diverging : bool ``[draws]``
-    """
+    """One chain of NUTS: ``weights [draws, K]`` and what the sampler did."""
 
     weights: Float[Array, "draws K"]
-    lp: Float[Array, " draws"]
-    energy: Float[Array, " draws"]
-    acceptance_rate: Float[Array, " draws"]
-    step_size: Float[Array, " draws"]
-    n_steps: Int[Array, " draws"]
-    diverging: Bool[Array, " draws"]
+    transitions: Transitions
+
+    @property
+    def diverging(self) -> Bool[Array, " draws"]:
+        """Of the transitions, ``[draws]``."""
+        return self.transitions.diverging
 
 
 def potential(position: Float[Array, " D"], problem: Problem) -> Float[Array, ""]:
@@ -105,23 +87,7 @@ def nuts_chain(
         target_accept_prob=target_accept,
         max_tree_depth=max_tree_depth,
     )
-    constrain = dist.biject_to(problem.prior.support)
-
-    def advance(state: HMCState, _: None) -> tuple:
-        state = kernel.sample(state, (), {})
-        return state, Chain(
-            weights=constrain(state.z),
-            lp=-state.potential_energy,
-            energy=state.energy,
-            acceptance_rate=state.accept_prob,
-            step_size=state.adapt_state.step_size,
-            n_steps=state.num_steps,
-            diverging=state.diverging,
-        )
-
-    state = kernel.init(key, warmup, start, (), {})
-    state, _ = lax.scan(lambda s, _: (advance(s, None)[0], None), state, None, warmup)
-    return lax.scan(advance, state, None, draws)[1]
+    return Chain(*run_nuts(key, kernel, start, dist.biject_to(problem.prior.support), warmup, draws))
 
 
 _run_chain = jax.jit(nuts_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
@@ -180,30 +146,14 @@ def pointwise_log_likelihood(weights: Float[Array, "D K"], problem: Problem) -> 
     return lax.map(one, weights)
 
 
-class Mode(NamedTuple):
-    """Where NUTS starts: the mode of the unconstrained density and a covariance from its curvature."""
-
-    position: Float[np.ndarray, " D"]
-    covariance: Float[np.ndarray, "D D"]
-
-
 def posterior_mode(problem: Problem) -> Mode:
-    """Climb to the mode (L-BFGS) and measure its curvature by differences of gradients.
+    """The mode of the unconstrained density, climbed to from its origin.
 
     The dissertation's estimate, were the prior flat; here only a place to start from.
     """
 
-    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, gradient = _potential_and_gradient(x, problem)
-        return float(value), np.asarray(gradient)
-
     size = dist.biject_to(problem.prior.support).inverse_shape(problem.prior.event_shape)
-    mode = optimize.minimize(objective, np.zeros(size), jac=True, method="L-BFGS-B").x
-    offsets = 1e-4 * np.eye(len(mode))
-    curvature = np.stack([objective(mode + h)[1] - objective(mode - h)[1] for h in offsets]) / 2e-4
-    scales, axes = np.linalg.eigh((curvature + curvature.T) / 2)
-    scales = np.maximum(scales, max(scales.max() / _MAX_STRETCH**2, 1e-8))
-    return Mode(mode, (axes / scales) @ axes.T)
+    return mode_of(lambda x: _potential_and_gradient(x, problem), np.zeros(size))
 
 
 def gather(
@@ -301,13 +251,10 @@ def sample_posterior(
     run = partial(
         _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
     )
-    # Threads rather than vmap: mapped chains wait for the longest tree, and the solves do not batch.
-    with ThreadPoolExecutor(min(chains, os.cpu_count() or 1)) as pool:
-        jobs = [
-            pool.submit(lambda k, x: jax.block_until_ready(run(k, problem, x, mode.covariance)), k, x)
-            for k, x in zip(jax.random.split(chain_key, chains), starts, strict=True)
-        ]
-        chain: Chain = jax.tree.map(lambda *xs: np.stack(xs), *[job.result() for job in jobs])
+    keys = jax.random.split(chain_key, chains)
+    chain: Chain = in_threads(
+        run, [(k, problem, x, mode.covariance) for k, x in zip(keys, starts, strict=True)]
+    )
     flat = jnp.asarray(chain.weights.reshape(chains * draws, -1))
     shape = (chains, draws, demonstration.n_trajectories)
     log_likelihood = np.asarray(pointwise_log_likelihood(flat, problem))[:, rows].reshape(shape)
@@ -331,7 +278,7 @@ def _inference_data(
     max_tree_depth: int,
 ) -> az.InferenceData:
     mdp = problem.mdp
-    depth = np.floor(np.log2(np.maximum(chain.n_steps, 1))).astype(int) + 1
+    n_steps = chain.transitions.n_steps
     names = {
         f"{kind}_name": (f"{kind}_index", np.asarray(labels))
         for kind, labels in (("state", mdp.labels.states), ("action", mdp.labels.actions))
@@ -351,14 +298,9 @@ def _inference_data(
     idata = az.from_dict(
         posterior={"weights": chain.weights},
         sample_stats={
-            "lp": chain.lp,
-            "energy": chain.energy,
-            "acceptance_rate": chain.acceptance_rate,
-            "step_size": chain.step_size,
-            "n_steps": chain.n_steps,
-            "tree_depth": depth,
-            "reached_max_treedepth": chain.n_steps >= 2**max_tree_depth - 1,
-            "diverging": chain.diverging,
+            **chain.transitions._asdict(),
+            "tree_depth": np.floor(np.log2(np.maximum(n_steps, 1))).astype(int) + 1,
+            "reached_max_treedepth": n_steps >= 2**max_tree_depth - 1,
         },
         log_likelihood={"demonstration": log_likelihood},
         observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},
