@@ -131,6 +131,19 @@ OBSERVATION = Assumption(
     "of n_o values is",
 )  # fmt: skip
 PREDICATES_SEEN = Assumption("predicates_seen", "every predicate is observed in the first session")
+INDEPENDENT_PREDICATES = Assumption(
+    "independent_predicates", "every predicate is reported rightly or wrongly by itself, with one "
+    "probability at every pair and step",
+)  # fmt: skip
+KNOWN_TRUTHS = Assumption(
+    "known_truths", "reliabilities were counted on n_o independent reports whose truth was known"
+)
+OTHER_REPORTS = Assumption(
+    "other_reports", "reliabilities were counted on other reports than those of the trajectories"
+)
+EXPERTS_POSTERIOR = Assumption(
+    "experts_posterior", "hidden pairs are filled in under weights as good as the expert's"
+)
 FULL_VIEW = Assumption("full_view", "every step is seen")
 
 EXPERT = (FEATURES, WEIGHTS, SOFT_EXPERT, INDEPENDENT, WHOLE)

@@ -5,10 +5,11 @@ and the assumptions that it rests on (:mod:`.assumptions`). :func:`.assumptions.
 be decided from an MDP, weights and a run, and :meth:`Bound.guarantee` refuses where one of them fails.
 
 The dissertation numbers its results twice (chapters 4 and 6, and again in appendices B and E); both numbers
-are given. Common notation: ``n`` independent trajectories, ``K`` features in [0, 1], discount ``gamma``,
-``epsilon`` the error of one feature's discounted average ``(1 - gamma) phi_hat_k`` in [0, 1], so that the
-program's slack is ``beta = epsilon / (1 - gamma)``. Log-likelihoods are those of the ``features``
-statistic, ``sum_t gamma^t log pi(a_t | s_t)``, in nats per (infinitely long) trajectory.
+are given; those of chapter 6.1, about noisy perception, are in :mod:`.perception_bounds`. Common notation:
+``n`` independent trajectories, ``K`` features in [0, 1], discount ``gamma``, ``epsilon`` the error of one
+feature's discounted average ``(1 - gamma) phi_hat_k`` in [0, 1], so that the program's slack is ``beta =
+epsilon / (1 - gamma)``. Log-likelihoods are those of the ``features`` statistic, ``sum_t gamma^t log pi(a_t |
+s_t)``, in nats per (infinitely long) trajectory.
 
 What the theorems say, read closely. The program's solution is at most ``beta |theta_E|_1`` nats worse than
 the expert's weights *on the data it was fitted to*, surely, with no probability involved. What holds with
@@ -37,8 +38,6 @@ from .assumptions import (
     FEATURES,
     FULL_VIEW,
     INDEPENDENT,
-    OBSERVATION,
-    PREDICATES_SEEN,
     PROGRAM_SOLVED,
     SOLVED,
     WEIGHTS,
@@ -263,111 +262,6 @@ def monotonicity(
         np.flatnonzero(change < 0) + 2,
         float(sizes[-1] / sizes[:-1].sum()),
     )
-
-
-# -- chapter 6.1 and appendix E -----------------------------------------------------------------------
-
-
-class Perception(NamedTuple):
-    """What RIMEO's bounds ask about perception.
-
-    ``samples`` used to estimate the observation model (``n_o``), its error ``epsilon_o``, the number of
-    ``predicates`` (``|Psi|``), and the ``longest`` trajectory's steps (``L``).
-    """
-
-    samples: float
-    epsilon_o: float
-    predicates: int
-    longest: int
-
-
-def rimeo_constraint_bound(
-    size: float, samples: float, epsilon: float, epsilon_s: float, perception: Perception, n_features: int
-) -> Bound:
-    """Lemma 4 (chapter 6), Lemma 8 (appendix E): constraint bound under noisy, estimated perception.
-
-    ``(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon_r = epsilon + epsilon_s + L |Psi| epsilon_o`` with
-    probability at least ``max(0, 1 - delta - delta_s - delta_o)``, ``delta_o = 2 K |Psi| exp(-2 n_o
-    epsilon_o^2)``.
-    """
-    lemma = lme_constraint_bound(size, samples, epsilon, epsilon_s, n_features)
-    _counted("predicates", perception.predicates), _counted("longest", perception.longest)
-    deltas = (
-        failure_probability(size, epsilon, n_features),
-        failure_probability(samples, epsilon_s, n_features),
-        failure_probability(perception.samples, perception.epsilon_o, n_features * perception.predicates),
-    )
-    error = lemma.error + perception.longest * perception.predicates * perception.epsilon_o
-    return Bound(
-        "Lemma 4 (Lemma 8 of appendix E)",
-        "(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + epsilon_s + L |Psi| epsilon_o",
-        error,
-        max(0.0, 1 - sum(deltas)),
-        error,
-        (FEATURES, INDEPENDENT, WHOLE, COMPLETION, OBSERVATION, PREDICATES_SEEN),
-    )
-
-
-def rimeo_confidence(
-    size: float,
-    samples: float,
-    epsilon: float,
-    epsilon_s: float,
-    perception: Perception,
-    n_features: int,
-    discount: float,
-) -> Bound:
-    """Theorem 1 (chapter 6), Theorem 6 (appendix E): confidence for RIMEO.
-
-    ``LL(theta_E) - LL(theta^i) <= 2 K epsilon_r / (1 - gamma)`` with probability ``max(0, 1 - delta_r)``.
-    """
-    lemma = rimeo_constraint_bound(size, samples, epsilon, epsilon_s, perception, n_features)
-    return Bound(
-        "Theorem 6 of appendix E",
-        "LL(theta_E) - LL(theta) <= 2 K epsilon_r / (1 - gamma)",
-        2 * n_features * lemma.error / (1 - _discounted(discount)),
-        lemma.confidence,
-        lemma.error,
-        (*EXPERT, COMPLETION, OBSERVATION, PREDICATES_SEEN, *PROGRAM_SOLVED),
-    )
-
-
-def rimeo_no_regret(
-    c: float,
-    session_sizes: Int[np.ndarray, " T"] | Sequence[int],
-    session_samples: Int[np.ndarray, " T"] | Sequence[int],
-    perception: Perception,
-    n_features: int,
-    discount: float,
-) -> Regret:
-    """Theorem 2 (chapter 6), Theorem 7 (appendix E): regret with ``epsilon_{r,i} = c (1 - gamma) / i``.
-
-    The relaxation is spent in thirds on ``epsilon``, ``epsilon_s`` and ``L |Psi| epsilon_o`` (the
-    dissertation leaves it open); ``perception.samples`` is what each session adds to ``n_o``, and
-    ``session_samples [T]`` are the draws ``n_s`` of each session. The remark on growing sessions at
-    :func:`no_regret` applies to all three.
-    """
-    _counted("predicates", perception.predicates), _counted("longest", perception.longest)
-    plain = no_regret(c, session_sizes, n_features, discount)
-    i = np.arange(1, len(plain.average) + 1)
-    third = c * (1 - discount) / i / 3
-    samples = _session_sizes(session_samples)
-    if len(samples) != len(i):
-        raise ValueError(f"{len(i)} session sizes, but {len(samples)} numbers of samples")
-    epsilon_o = third / (perception.longest * perception.predicates)
-    events = n_features * perception.predicates
-    delta = 2 * (
-        n_features * np.exp(-2 * np.cumsum(_session_sizes(session_sizes)) * third**2)
-        + n_features * np.exp(-2 * samples * third**2)
-        + events * np.exp(-2 * perception.samples * i * epsilon_o**2)
-    )
-    confidence = np.cumprod(np.maximum(0.0, 1 - delta))
-    bound = plain.bound._replace(
-        source="Theorem 7 of appendix E",
-        confidence=max(0.0, 1 - float(delta.sum())),
-        assumptions=(*EXPERT, COMPLETION, OBSERVATION, PREDICATES_SEEN, DIMINISHING, SOLVED),
-    )
-    return Regret(plain.average, confidence, bound)
 
 
 # -- from the data themselves -------------------------------------------------------------------------

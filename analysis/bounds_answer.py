@@ -9,6 +9,7 @@ import pandas as pd
 
 from .assumptions import Bound, check
 from .bounds import demonstrations_needed, lme_i2rl_confidence
+from .perception_bounds import perception_needed
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -21,14 +22,17 @@ class Answer(NamedTuple):
     knowing nothing achieves.
 
     Where the expert is known, ``ignorance_nats`` is the expected log-likelihood gap of zero weights, and
-    ``informative`` the trajectories from which on each bound promises less than that.
+    ``informative`` the trajectories from which on each bound promises less than that. ``perception`` is what
+    the same error takes under noisy perception (:func:`.perception_needed`), where that was asked for.
     """
 
     confidence: float
+    n_features: int
     table: pd.DataFrame
     bound: Bound
     ignorance_nats: float | None = None
     informative: pd.DataFrame | None = None
+    perception: pd.DataFrame | None = None
 
 
 def answer(
@@ -39,14 +43,36 @@ def answer(
     discount: float | None = None,
     deviation: float | None = None,
     mdp: str | None = None,
+    predicates: int | None = None,
+    steps: int | None = None,
 ) -> Answer:
     """Ask the theorem and the tighter bounds.
 
     With ``mdp`` (``patrol1`` to ``patrol3``) the number of features, the discount and the spread of the
     features are those of an expert who softly obeys the patrol's true weights, and assumptions are checked
-    against it. Raises ``ValueError`` for numbers out of range, for neither ``features`` nor ``mdp``, and for
-    both ``mdp`` and something that it decides.
+    against it. ``predicates`` and ``steps`` (both or none) are the ``|Psi|`` and ``L`` of noisy perception.
+    Raises ``ValueError`` for numbers out of range, for neither ``features`` nor ``mdp``, for both ``mdp`` and
+    something that it decides, and for ``predicates`` without ``steps`` or the other way round.
     """
+    if (predicates is None) != (steps is None):
+        raise ValueError("noisy perception is described by --predicates and --steps: give both or neither")
+    found = _without_noise(features, epsilon, confidence, epsilon_s, discount, deviation, mdp)
+    if predicates is None or steps is None:
+        return found
+    return found._replace(
+        perception=perception_needed(found.n_features, predicates, steps, epsilon + epsilon_s, confidence)
+    )
+
+
+def _without_noise(
+    features: int | None,
+    epsilon: float,
+    confidence: float,
+    epsilon_s: float,
+    discount: float | None,
+    deviation: float | None,
+    mdp: str | None,
+) -> Answer:
     for name, error in (("epsilon", epsilon), ("epsilon-s", epsilon_s)):
         if error >= 1:
             raise ValueError(f"{name} is the error of an average of values in [0, 1]: below 1, got {error}")
@@ -58,7 +84,7 @@ def answer(
         table = demonstrations_needed(
             features, epsilon, confidence, gamma, epsilon_s=epsilon_s, deviations=spread
         )
-        return Answer(confidence, table, _theorem(table, epsilon, epsilon_s, features, gamma))
+        return Answer(confidence, features, table, _theorem(table, epsilon, epsilon_s, features, gamma))
     if features is not None or discount is not None or deviation is not None:
         raise ValueError("--mdp decides the features, the discount and their deviation: leave those out")
     return _of_patrol(mdp, epsilon, confidence, epsilon_s)
@@ -88,7 +114,7 @@ def _of_patrol(name: str, epsilon: float, confidence: float, epsilon_s: float) -
     informative = demonstrations_needed(
         process.n_features, half, confidence, gamma, epsilon_s=half, deviations=spread
     )
-    return Answer(confidence, table, bound, ignorance, informative)
+    return Answer(confidence, process.n_features, table, bound, ignorance, informative)
 
 
 def _theorem(table: pd.DataFrame, epsilon: float, epsilon_s: float, features: int, discount: float) -> Bound:
@@ -106,6 +132,9 @@ def summary(answer: Answer) -> dict[str, Any]:
         "assumptions": [a._asdict() for a in answer.bound.assumptions],
         "ignorance_nats": answer.ignorance_nats,
         "informative": None if answer.informative is None else answer.informative["trajectories"].to_dict(),
+        "perception": None
+        if answer.perception is None
+        else answer.perception.reset_index().to_dict("records"),
     }
 
 
@@ -130,6 +159,8 @@ def print_answer(answer: Answer, console: Console) -> None:
         "Exact completion: of the hidden steps, under weights as good as the expert's.\n"
         "Observed spread: a plan; the guarantee is the bound computed from the data (observed_bound)."
     )
+    if answer.perception is not None:
+        _print_perception(answer.perception, console)
     if answer.informative is not None and answer.ignorance_nats < error:
         needed = answer.informative["trajectories"]
         console.print(
@@ -150,3 +181,23 @@ def print_answer(answer: Answer, console: Console) -> None:
     for a in bound.assumptions:
         assumed.add_row(a.statement, _SYMBOLS[a.holds] + (f": {a.reason}" if a.reason else ""))
     console.print(assumed)
+
+
+def _print_perception(needed: pd.DataFrame, console: Console) -> None:
+    from rich.table import Table
+
+    table = Table(title="The same error under noisy perception")
+    names = {"printed": "Theorem 6 of appendix E", "corrected": "corrected"}
+    table.add_column("bound")
+    for name in ("trajectories", "draws of the hidden pairs", "reports of known truth", "their error"):
+        table.add_column(name, justify="right")
+    for row in needed.itertuples():
+        draws = str(row.draws) if row.draws else "none"
+        table.add_row(
+            names[row.Index], str(row.trajectories), draws, str(row.reports), f"{row.epsilon_o:.3g}"
+        )
+    console.print(table)
+    console.print(
+        "Filled in under weights as good as the expert's. Under weights that are still being learned, no "
+        "number\nof trajectories is enough where perception is noisy enough."
+    )

@@ -171,13 +171,19 @@ def bounds(
     mdp: Annotated[
         str | None, typer.Option(help="patrol1, patrol2 or patrol3: its features, discount and spread.")
     ] = None,
+    predicates: Annotated[
+        int | None, typer.Option(help="Predicates whose reliabilities noisy perception is described by.")
+    ] = None,
+    steps: Annotated[int | None, typer.Option(help="Steps of a trajectory, with --predicates.")] = None,
     as_json: Json = False,
 ) -> None:
     """Say how many demonstrations are enough: by the theorem, by tighter bounds, and what is assumed."""
     from . import bounds_answer
 
     with _reported_errors():
-        answer = bounds_answer.answer(features, epsilon, confidence, epsilon_s, discount, deviation, mdp)
+        answer = bounds_answer.answer(
+            features, epsilon, confidence, epsilon_s, discount, deviation, mdp, predicates, steps
+        )
     if as_json:
         print(json.dumps(_plain(bounds_answer.summary(answer))))
     else:

@@ -225,8 +225,10 @@ def full_view_coverage(
     misses = (1 - discount) * jnp.max(jnp.abs(target - expert.features), axis=1)
     gaps = expected_gaps(mdp, expert, target, jnp.full_like(target, epsilon / (1 - discount)))
     rows = [
-        _row(setting, f"{theorem.source}, its constraints", size, confidence, np.full(runs, epsilon), misses),
-        _row(setting, theorem.source, size, confidence, np.full(runs, theorem.error), gaps),
+        coverage_of(
+            setting, f"{theorem.source}, its constraints", size, confidence, np.full(runs, epsilon), misses
+        ),
+        coverage_of(setting, theorem.source, size, confidence, np.full(runs, theorem.error), gaps),
     ]
     for predictable, name in ((False, "observed variances"), (True, "observed variances, predictable")):
         rows += _observed_rows(setting, expert, features, confidence, predictable, name)
@@ -245,8 +247,8 @@ def _observed_rows(
     gaps = expected_gaps(mdp, expert, targets, slacks)
     size = features.shape[1]
     return [
-        _row(setting, f"{name}, its constraints (of 1)", size, confidence, np.ones(len(each)), misses),
-        _row(setting, name, size, confidence, errors, gaps),
+        coverage_of(setting, f"{name}, its constraints (of 1)", size, confidence, np.ones(len(each)), misses),
+        coverage_of(setting, name, size, confidence, errors, gaps),
     ]
 
 
@@ -278,10 +280,10 @@ def occluded_coverage(
         target = features.mean(axis=1)
         if error is None:
             seen = (1 - discount) * jnp.max(jnp.abs(target - expert.features), axis=1)
-            rows.append(_row(setting, name, size, confidence, np.full(runs, slack), seen))
+            rows.append(coverage_of(setting, name, size, confidence, np.full(runs, slack), seen))
         else:
             gaps = expected_gaps(mdp, expert, target, jnp.full_like(target, slack / (1 - discount)))
-            rows.append(_row(setting, name, size, confidence, np.full(runs, error), gaps))
+            rows.append(coverage_of(setting, name, size, confidence, np.full(runs, error), gaps))
     name = "observed variances, predictable, exact completion"
     return rows + _observed_rows(setting, expert, completed.exact, exactly.confidence, True, name)
 
@@ -294,12 +296,23 @@ def learned_coverage(
     The lemma's premise about completions is then not known to hold; the bound is the theorem's for ``draws``
     completions a trajectory. All trajectories come in one session.
     """
-    mdp, discount, n_features = setting.mdp, float(setting.mdp.discount), setting.mdp.n_features
-    expert = expert_of(mdp, setting.weights)
+    discount, n_features = float(setting.mdp.discount), setting.mdp.n_features
     epsilon, epsilon_s = error_for(size, delta, n_features), error_for(size * draws, delta, n_features)
     theorem = lme_i2rl_confidence(size, size * draws, epsilon, epsilon_s, n_features, discount)
-    learner = lme_i2rl(mdp, setting.sensor, statistic="features", slack=theorem.epsilon, iterations=50)
-    learners = fleet(learner)
+    gaps = learned_gaps(key, setting, setting.sensor, runs, size, theorem.epsilon, batch)
+    name = f"{theorem.source}, LME-I2RL"
+    return [coverage_of(setting, name, size, theorem.confidence, np.full(runs, theorem.error), gaps)]
+
+
+def learned_gaps(
+    key: Array, setting: Setting, assumed: Imperfection, runs: int, size: int, slack: float, batch: int = 25
+) -> Float[np.ndarray, " runs"]:
+    """Expected gaps of LME-I2RL with the features statistic, which believes in the sensor ``assumed``.
+
+    ``slack`` is the ``epsilon`` of its program; ``size`` trajectories come in one session.
+    """
+    mdp, expert = setting.mdp, expert_of(setting.mdp, setting.weights)
+    learners = fleet(lme_i2rl(mdp, assumed, statistic="features", slack=slack, iterations=50))
     gap = jax.jit(jax.vmap(partial(_gap_of_weights, mdp, expert)))
     walk, begin = jax.random.split(key)
     codes = simulate_codes(walk, mdp, expert, setting.sensor, setting.length, runs, size)
@@ -310,8 +323,7 @@ def learned_coverage(
         demonstrations = Demonstration(kind, state, action, jnp.full(kind.shape, jnp.nan))  # type: ignore[arg-type]
         states = learners.init(jax.random.fold_in(begin, i), len(part))
         gaps.append(gap(learners.update(states, demonstrations)[0].weights))
-    name = f"{theorem.source}, LME-I2RL"
-    return [_row(setting, name, size, theorem.confidence, np.full(runs, theorem.error), np.concatenate(gaps))]
+    return np.concatenate(gaps)
 
 
 def regret_coverage(
@@ -334,7 +346,7 @@ def regret_coverage(
         gaps.append(expected_gaps(mdp, expert, total / sizes[:i].sum(), jnp.full_like(total, c / i)))
     average = np.cumsum(gaps, axis=0) / np.arange(1, sessions + 1)[:, None]
     confidence = float(regret.confidence[-1])
-    row = _row(
+    row = coverage_of(
         setting, regret.bound.source, sizes.sum(), confidence, np.full(runs, regret.average[-1]), average[-1]
     )
     return [row._replace(covered=float((average <= regret.average[:, None]).all(axis=0).mean()))]
@@ -350,9 +362,15 @@ def _gap_of_weights(mdp: TabularMDP, expert: Expert, weights: Float[Array, " K"]
     return expected_gap(mdp, expert, weights, soft_plan(mdp, reward_of(mdp, weights)).values)
 
 
-def _row(
-    setting: Setting, result: str, size: int, confidence: float, bounds: np.ndarray, seen: ArrayLike
+def coverage_of(
+    setting: Setting,
+    result: str,
+    size: int,
+    confidence: float,
+    bounds: Float[np.ndarray, " runs"],
+    seen: Float[ArrayLike, " runs"],
 ) -> Coverage:
+    """Compare what was ``seen`` in each run with its bound."""
     seen = np.asarray(seen)
     return Coverage(
         setting.name, result, int(size), confidence, float((seen <= bounds).mean()), float(np.median(bounds)),

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from i2rl.analysis.assumptions import BoundNotGuaranteed
 from i2rl.analysis.bounds import (
-    Perception,
     error_for,
     failure_probability,
     lme_constraint_bound,
@@ -22,9 +21,6 @@ from i2rl.analysis.bounds import (
     no_regret,
     no_regret_sizes,
     observed_bound,
-    rimeo_confidence,
-    rimeo_constraint_bound,
-    rimeo_no_regret,
     size_for,
     sure_gap,
     table_7_1a,
@@ -84,16 +80,6 @@ def test_without_samples_of_the_hidden_steps_there_is_no_confidence():
     assert lme_i2rl_confidence(10_000, 0, 0.1, 0.05, 6, 0.99).confidence == 0
 
 
-def test_perfect_perception_makes_rimeos_bound_lmes():
-    perception = Perception(samples=10**9, epsilon_o=1e-4, predicates=8, longest=3)
-    rimeo = rimeo_constraint_bound(300, 1000, 0.1, 0.05, perception, 6)
-    lme = lme_constraint_bound(300, 1000, 0.1, 0.05, 6)
-    assert rimeo.confidence == pytest.approx(lme.confidence)
-    assert rimeo.error == pytest.approx(lme.error + 3 * 8 * 1e-4)
-    theorem = rimeo_confidence(300, 1000, 0.1, 0.05, perception, 6, 0.9)
-    assert theorem.error == pytest.approx(2 * 6 * rimeo.error / 0.1)
-
-
 def test_the_programs_solution_never_loses_more_than_the_sure_gap(random_mdp):
     for seed in range(5):
         mdp = random_mdp(seed)
@@ -149,15 +135,6 @@ def test_the_regret_bound_sums_the_theorems_bound_over_sessions():
     np.testing.assert_allclose(regret.average, np.cumsum(each) / np.arange(1, 31))
     # The proof's log T is too small a bound on the harmonic sum.
     assert regret.average[-1] > 2 * 4 * 5.0 * math.log(30) / 30
-
-
-def test_rimeos_regret_needs_more_than_lmes():
-    perception = Perception(samples=10**7, epsilon_o=0.01, predicates=2, longest=3)
-    sizes = [100_000] * 5
-    rimeo = rimeo_no_regret(5.0, sizes, sizes, perception, 4, 0.9)
-    plain = no_regret(5.0, sizes, 4, 0.9)
-    assert (rimeo.confidence <= plain.confidence).all()
-    np.testing.assert_allclose(rimeo.average, plain.average)
 
 
 def test_monotonicity_names_the_sessions_that_fall():
