@@ -54,12 +54,13 @@ def test_another_sensor_is_refused(setting):
 
 def test_completion_uses_the_reliabilities_of_its_run(setting):
     mdp, expert, noise = setting.mdp, expert_of(setting.mdp, setting.weights), setting.sensor
-    codes = simulate_codes(jax.random.key(1), mdp, expert, noise.reading, 4, 2, 10)
-    p = jnp.array([[0.8, 0.8, 0.8], [0.6, 0.7, 0.9]])
-    found = complete_under(jax.random.key(2), mdp, expert, noise, p, codes, 1).exact
+    # Shapes are those of the study below, which is then compiled once.
+    codes = simulate_codes(jax.random.key(1), mdp, expert, noise.reading, 4, 30, 50)
+    p = jnp.asarray(np.random.default_rng(0).uniform(0.6, 0.9, (30, 3)))
+    found = complete_under(jax.random.key(2), mdp, expert, noise, p, codes, 2).exact
     for run in range(2):
         reading = FeatureNoise(noise.predicates, p[run], noise.reportable).reading
-        alone = complete_features(jax.random.key(3), mdp, expert, reading, codes[run : run + 1], 1).exact
+        alone = complete_features(jax.random.key(3), mdp, expert, reading, codes[run : run + 1], 2).exact
         np.testing.assert_allclose(found[run], alone[0], atol=1e-12)
 
 
@@ -87,20 +88,21 @@ def test_an_error_that_leaves_no_reliability_is_refused():
 
 def test_reports_that_say_nothing_teach_nothing_under_the_learners_own_weights():
     """Theorem 6 as printed is false for them: its bound falls with data, the loss does not."""
-    setting = shift_setting(0.5, 25)
+    setting = shift_setting(0.5, 4)
     nothing = ignorance_gap(setting.mdp, setting.weights)
-    perception = Perception(samples=10**10, epsilon_o=2e-5, predicates=3, longest=25)
+    perception = Perception(samples=10**9, epsilon_o=1e-4, predicates=3, longest=4)
     theorem = rimeo_confidence(10**5, 10**5, 0.01, 0.01, perception, 2, 0.8)
     assert theorem.confidence > 0.99
     assert theorem.error < nothing / 2
     # Whatever was reported, the posterior under zero weights has the features of zero weights.
     mdp, expert = setting.mdp, expert_of(setting.mdp, setting.weights)
     nobody = expert_of(mdp, jnp.zeros(2))
-    codes = simulate_codes(jax.random.key(6), mdp, expert, setting.sensor.reading, 25, 1, 5)
-    completed = complete_features(jax.random.key(7), mdp, nobody, setting.sensor, codes, 1).exact
+    codes = simulate_codes(jax.random.key(6), mdp, expert, setting.sensor.reading, 4, 30, 50)
+    p = jnp.broadcast_to(setting.sensor.reliabilities, (30, 3))
+    completed = complete_under(jax.random.key(7), mdp, nobody, setting.sensor, p, codes, 2).exact
     np.testing.assert_allclose(completed, np.broadcast_to(nobody.features, completed.shape))
-    slack = jnp.full((1, 2), theorem.epsilon / (1 - mdp.discount))
-    np.testing.assert_allclose(expected_gaps(mdp, expert, completed.mean(axis=1), slack), nothing)
+    slacks = jnp.full((30, 2), theorem.epsilon / (1 - mdp.discount))
+    np.testing.assert_allclose(expected_gaps(mdp, expert, completed.mean(axis=1), slacks), nothing)
 
 
 def test_good_perception_teaches_under_the_learners_own_weights():
