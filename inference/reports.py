@@ -1,0 +1,403 @@
+"""What perception reports of a session, as evidence about the truth, and what a posterior says of perception.
+
+Everything is in *classes* of pairs that no predicate tells apart: the table of Eq. 6.5 is ``[C, C]`` instead
+of ``[S, A, S, A]``. A report that leaves the state or the action open is the set of pairs it could be.
+
+A score ``c`` is the perception's probability that its report is right. A scored report follows
+``c [o = g] + (1 - c) O(o | g, o != g)``, where ``O(o | g, o != g)`` is Eq. 6.5 among the *other* pairs: the
+distribution of greatest entropy that has this probability of being right and the expected agreement
+asked for. An unscored report follows ``O(o | g)`` itself. Both share one set of reliabilities.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from ..models.demonstration import HIDDEN, SEEN, UNKNOWN, Demonstration
+from .maxent import quadratic_l1
+
+# A perception that is certain may still be wrong: a score of one would rule out every other truth.
+CERTAIN = 0.999
+# A logit of more is one error in 160 000.
+LIMIT = 12.0
+
+_MAX_STEPS = 30
+_MAX_HALVINGS = 20
+
+
+class ReportClasses(NamedTuple):
+    """Pairs gathered by their predicates and by whether they can be reported.
+
+    Fields
+    ------
+    agree : float ``[C, C, J]``
+        Whether each predicate of a truth (first) is that of a report (second).
+    reportable : float ``[C]``
+        Number of pairs of each class that perception may report: all of a class, or none.
+    of_pair : int ``[S, A]``
+    members : float ``[S*A, C]``
+        One where a pair is in a class.
+    can_be_reported : bool ``[S, A]``
+    """
+
+    agree: Float[Array, "C C J"]
+    reportable: Float[Array, " C"]
+    of_pair: Int[Array, "S A"]
+    members: Float[Array, "SA C"]
+    can_be_reported: Bool[Array, "S A"]
+
+    @property
+    def others(self) -> Float[Array, "C C"]:
+        """How many pairs of each class (second) could be reported wrongly of a truth in each (first)."""
+        return self.reportable - jnp.diag((self.reportable > 0).astype(float))
+
+
+def report_classes(predicates: ArrayLike, reportable: ArrayLike | None = None) -> ReportClasses:
+    """Gather the pairs ``[S, A]``; arguments and errors as of :class:`~i2rl.models.FeatureNoise`."""
+    psi = np.asarray(predicates)
+    mask = np.ones(psi.shape[1:], bool) if reportable is None else np.asarray(reportable, bool)
+    keys = np.concatenate([psi.astype(int), mask[None]]).reshape(len(psi) + 1, -1).T
+    vectors, of_pair = np.unique(keys, axis=0, return_inverse=True)
+    of_pair = of_pair.reshape(mask.shape)
+    return ReportClasses(
+        jnp.asarray((vectors[:, None, :-1] == vectors[None, :, :-1]).astype(float)),
+        jnp.asarray(np.bincount(of_pair[mask], minlength=len(vectors)).astype(float)),
+        jnp.asarray(of_pair),
+        jax.nn.one_hot(of_pair.ravel(), len(vectors), dtype=float),
+        jnp.asarray(mask),
+    )
+
+
+class SensorTables(NamedTuple):
+    """Eq. 6.5 normalised, truths first; each entry is of *one* pair of the report's class.
+
+    Fields
+    ------
+    plain : float ``[C, C]``
+        ``O(o | g)``.
+    wrong : float ``[C, C]``
+        ``O(o | g, o != g)``.
+    """
+
+    plain: Float[Array, "C C"]
+    wrong: Float[Array, "C C"]
+
+
+def sensor_tables(classes: ReportClasses, logits: Float[Array, " J"]) -> SensorTables:
+    """The tables of reliabilities ``p_j`` with these logits."""
+    exponents = classes.agree @ logits
+    likelihoods = jnp.exp(exponents - exponents.max(1, keepdims=True))
+    total = likelihoods @ classes.reportable
+    others = jnp.sum(likelihoods * classes.others, axis=1)
+    possible = others > 0
+    wrong = likelihoods / jnp.where(possible, others, 1.0)[:, None]
+    return SensorTables(likelihoods / total[:, None], jnp.where(possible[:, None], wrong, 0.0))
+
+
+class SessionReports(NamedTuple):
+    """A session's reports, prepared for any reliabilities.
+
+    Fields
+    ------
+    kind : int ``[n, L]``
+    said : float ``[n, L, C]``
+        How many pairs of each class the report could be.
+    same : bool ``[n, L, S, A]``
+        Which pairs it could be.
+    score : float ``[n, L]``
+        NaN for none.
+    """
+
+    kind: Int[Array, "n L"]
+    said: Float[Array, "n L C"]
+    same: Bool[Array, "n L S A"]
+    score: Float[Array, "n L"]
+
+    @property
+    def seen(self) -> Bool[Array, "n L"]:
+        """Which steps were reported."""
+        return self.kind == SEEN
+
+    @property
+    def whole(self) -> Bool[Array, "n L"]:
+        """Which reports name one pair."""
+        return self.seen & (jnp.sum(self.said, axis=2) == 1)
+
+
+def session_reports(
+    classes: ReportClasses, demonstration: Demonstration, scored: bool = True
+) -> SessionReports:
+    """Prepare a demonstration; with ``scored`` false its scores are left aside."""
+    kind, state, action, score = (jnp.asarray(x) for x in demonstration)
+    n_states, n_actions = classes.of_pair.shape
+    states = (state[..., None] == UNKNOWN) | (state[..., None] == jnp.arange(n_states))
+    actions = (action[..., None] == UNKNOWN) | (action[..., None] == jnp.arange(n_actions))
+    seen = kind == SEEN
+    same = states[..., :, None] & actions[..., None, :] & classes.can_be_reported & seen[..., None, None]
+    said = same.reshape(*same.shape[:2], -1).astype(float) @ classes.members
+    # Beyond certainty nothing is gained, and nothing could be unlearned.
+    score = jnp.where(seen & scored, jnp.clip(score, 0.0, CERTAIN), jnp.nan)
+    return SessionReports(kind, said, same, score)
+
+
+class _Likelihood(NamedTuple):
+    """``P(report | g)`` of every step, and its parts: ``right + wrong`` where scored, else ``plain``."""
+
+    plain: Float[Array, "n L C"]
+    right: Float[Array, "n L S A"]
+    wrong: Float[Array, "n L S A"]
+    scored: Bool[Array, "n L S A"]
+    total: Float[Array, "n L S A"]
+
+
+def _likelihood(
+    classes: ReportClasses,
+    tables: SensorTables,
+    reports: SessionReports,
+    confidence: Float[Array, "... S A"],
+) -> _Likelihood:
+    """Of every step and truth; ``confidence`` that a report is right given the truth, NaN for none."""
+    scored = jnp.broadcast_to(~jnp.isnan(confidence), reports.same.shape)
+    c = jnp.where(scored, confidence, 0.0)
+    plain = reports.said @ tables.plain.T
+    itself = jnp.diag(tables.wrong)[classes.of_pair]
+    others = (reports.said @ tables.wrong.T)[..., classes.of_pair]
+    right = c * reports.same
+    wrong = (1 - c) * jnp.maximum(others - reports.same * itself, 0.0)
+    return _Likelihood(
+        plain, right, wrong, scored, jnp.where(scored, right + wrong, plain[..., classes.of_pair])
+    )
+
+
+def report_log_evidence(
+    classes: ReportClasses,
+    logits: Float[Array, " J"],
+    reports: SessionReports,
+    confidence: Float[Array, "... S A"],
+    presence: Float[Array, " S"] | None = None,
+) -> Float[Array, "n L S A"]:
+    """``log e_t(s, a)`` of every step under these reliabilities.
+
+    Parameters
+    ----------
+    classes, logits, reports
+    confidence : float ``[S, A]`` or ``[n, L, S, A]``
+        Probability that the report is right if the truth is ``(s, a)``; NaN where there are no scores.
+    presence : float ``[S]``, optional
+        Probability of being in view; everything is, by default.
+    """
+    total = _likelihood(classes, sensor_tables(classes, logits), reports, confidence).total
+    reading = jnp.where(total > 0, jnp.log(jnp.where(total > 0, total, 1.0)), -jnp.inf)
+    view = jnp.ones(classes.of_pair.shape[0]) if presence is None else presence
+    kind = reports.kind[..., None, None]
+    seen, hidden = jnp.log(view)[:, None], jnp.log1p(-view)[:, None]
+    return jnp.where(kind == SEEN, reading + seen, jnp.where(kind == HIDDEN, hidden, 0.0))
+
+
+# -- the statistic ------------------------------------------------------------------------------------
+
+
+class ReportStatistic(NamedTuple):
+    """All that is kept of reports: running averages over them.
+
+    Fields
+    ------
+    size : float
+        Number of reports.
+    plain : float ``[C, C]``
+        Share of unscored reports by class of truth (first) and report, under the posterior of their session.
+    wrong : float ``[C, C]``
+        Share of scored reports that are wrong, likewise.
+    right : float
+        Share of scored reports that are right.
+    scores, scored : float ``[S, A]``
+        Per report: sum of the scores of each reported pair, and their number (Eq. 6.6 is their ratio).
+    """
+
+    size: Float[Array, ""]
+    plain: Float[Array, "C C"]
+    wrong: Float[Array, "C C"]
+    right: Float[Array, ""]
+    scores: Float[Array, "S A"]
+    scored: Float[Array, "S A"]
+
+    @property
+    def confidence(self) -> Float[Array, "S A"]:
+        """``O_hat(o)`` of Eq. 6.6; NaN for pairs never reported with a score."""
+        some = self.scored > 0
+        return jnp.where(some, self.scores / jnp.where(some, self.scored, 1.0), jnp.nan)
+
+    def agreement(self, classes: ReportClasses) -> Float[Array, " J"]:
+        """Expected share of reports that agree with their truth on each predicate; NaN before any report."""
+        together = jnp.einsum("co,coj->j", self.plain + self.wrong, classes.agree) + self.right
+        return together / jnp.where(self.size > 0, jnp.sum(self.plain + self.wrong) + self.right, jnp.nan)
+
+
+def no_reports(classes: ReportClasses) -> ReportStatistic:
+    """The statistic before the first report."""
+    zero, table = jnp.zeros(()), jnp.zeros((len(classes.reportable),) * 2)
+    pairs = jnp.zeros(classes.of_pair.shape)
+    return ReportStatistic(zero, table, table, zero, pairs, pairs)
+
+
+def score_statistic(reports: SessionReports) -> tuple[Float[Array, "S A"], Float[Array, "S A"]]:
+    """Sum and number of scores by reported pair; reports that leave something open have no part in it."""
+    counts = reports.whole & ~jnp.isnan(reports.score)
+    weight = jnp.where(counts, reports.score, 0.0)
+    return jnp.einsum("nl,nlsa->sa", weight, reports.same.astype(float)), jnp.einsum(
+        "nl,nlsa->sa", counts.astype(float), reports.same.astype(float)
+    )
+
+
+def report_statistic(
+    classes: ReportClasses,
+    logits: Float[Array, " J"],
+    reports: SessionReports,
+    confidence: Float[Array, "... S A"],
+    pairs: Float[Array, "n L S A"],
+) -> ReportStatistic:
+    """What a posterior over truths ``pairs`` says of a session's reports."""
+    tables = sensor_tables(classes, logits)
+    parts = _likelihood(classes, tables, reports, confidence)
+    mass = pairs * reports.seen[..., None, None]
+    gathered = (jnp.where(parts.scored, 0.0, mass)).reshape(*mass.shape[:2], -1) @ classes.members
+    rate = jnp.where(parts.plain > 0, gathered / jnp.where(parts.plain > 0, parts.plain, 1.0), 0.0)
+    plain = jnp.einsum("nlc,nlo->co", rate, reports.said) * tables.plain
+    possible = parts.scored & (parts.total > 0)
+    share = jnp.where(possible, mass / jnp.where(possible, parts.total, 1.0), 0.0)
+    right = share * parts.right
+    # Wrong reports, as if the report could be anything it says, less the truth itself.
+    blame = share * (1 - jnp.where(parts.scored, confidence, 0.0))
+    by_class = blame.reshape(*mass.shape[:2], -1) @ classes.members
+    itself = (blame * reports.same).sum((0, 1)).reshape(-1) @ classes.members
+    wrong = (jnp.einsum("nlc,nlo->co", by_class, reports.said) - jnp.diag(itself)) * tables.wrong
+    size = jnp.sum(reports.seen).astype(float)
+    per_report = 1 / jnp.maximum(size, 1.0)
+    scores, scored = score_statistic(reports)
+    return ReportStatistic(
+        size,
+        plain * per_report,
+        jnp.maximum(wrong, 0.0) * per_report,
+        jnp.sum(right) * per_report,
+        scores * per_report,
+        scored * per_report,
+    )
+
+
+# -- the program --------------------------------------------------------------------------------------
+
+
+class SensorFit(NamedTuple):
+    """Reliabilities that explain the statistic.
+
+    Fields
+    ------
+    logits : float ``[J]``
+    agreement : float ``[J]``
+        Expected agreement of reports with their truths: the statistic's, to within the slack.
+    iterations : int
+    """
+
+    logits: Float[Array, " J"]
+    agreement: Float[Array, " J"]
+    iterations: Int[Array, ""]
+
+
+def _log_partitions(
+    classes: ReportClasses, logits: Float[Array, " J"], counts: Float[Array, "C C"]
+) -> tuple[Float[Array, " C"], Float[Array, "C C"]]:
+    """``log sum_o counts exp(logits.agree)`` and the distribution over classes of reports."""
+    log_counts = jnp.where(counts > 0, jnp.log(jnp.where(counts > 0, counts, 1.0)), -1e300)
+    terms = classes.agree @ logits + log_counts
+    return jax.nn.logsumexp(terms, axis=1), jax.nn.softmax(terms, axis=1)
+
+
+def fit_sensor(
+    classes: ReportClasses,
+    statistic: ReportStatistic,
+    slack: Float[Array, ""] | float,
+    start: Float[Array, " J"],
+    tolerance: float = 1e-8,
+) -> SensorFit:
+    """Solve the observation program's dual (proximal Newton): the program of
+    :class:`~i2rl.inference.observation_program.ObservationProgram`, traceable by JAX.
+
+    Minimises ``sum_g plain_g log Z_g + sum_g wrong_g log Z'_g - logits.matches + slack |logits|`` with ``Z'``
+    over the pairs other than the truth. ``slack`` is how far the expected agreement may be from the
+    statistic's; one error in a hundred reports is a slack of 0.01. Logits stay within ``LIMIT``.
+    """
+    full = jnp.broadcast_to(classes.reportable, classes.others.shape)
+    weights = statistic.plain.sum(1), statistic.wrong.sum(1)
+    matches = jnp.einsum("co,coj->j", statistic.plain + statistic.wrong, classes.agree)
+    beta = jnp.broadcast_to(jnp.asarray(slack, float), matches.shape)
+
+    def expand(logits: Float[Array, " J"]) -> tuple:
+        value, gradient = -logits @ matches, -matches
+        curvature = jnp.zeros((len(logits), len(logits)))
+        for weight, counts in zip(weights, (full, classes.others), strict=True):
+            log_z, share = _log_partitions(classes, logits, counts)
+            mean = jnp.einsum("co,coj->cj", share, classes.agree)
+            second = jnp.einsum("c,co,coj,cok->jk", weight, share, classes.agree, classes.agree)
+            value += weight @ log_z
+            gradient += weight @ mean
+            curvature += second - jnp.einsum("c,cj,ck->jk", weight, mean, mean)
+        return value + beta @ jnp.abs(logits), gradient, curvature
+
+    def residual(gradient: Array, logits: Array) -> Array:
+        # Zero where no step within the limits would help.
+        step = logits - gradient
+        step = jnp.sign(step) * jnp.maximum(jnp.abs(step) - beta, 0.0)
+        return jnp.max(jnp.abs(jnp.clip(step, -LIMIT, LIMIT) - logits))
+
+    def improve(carry: tuple) -> tuple:
+        logits, (value, gradient, curvature), _, count = carry
+        aim = quadratic_l1(curvature, gradient, beta, logits, jnp.asarray(tolerance / 10))
+        aim = jnp.clip(aim, -LIMIT, LIMIT)
+
+        def shorter(trial: tuple) -> tuple:
+            length, _, _ = trial
+            point = logits + length / 2 * (aim - logits)
+            return length / 2, point, expand(point)
+
+        def worse(trial: tuple) -> Array:
+            length, _, (there, *_) = trial
+            return ~(there <= value + 1e-14 * jnp.abs(value)) & (length > 0.5**_MAX_HALVINGS)
+
+        _, point, there = lax.while_loop(worse, shorter, (jnp.ones(()), aim, expand(aim)))
+        better = there[0] <= value + 1e-14 * jnp.abs(value)
+        point = jnp.where(better, point, logits)
+        there = jax.tree.map(lambda a, b: jnp.where(better, a, b), there, (value, gradient, curvature))
+        left = jnp.where(better, residual(there[1], point), 0.0)
+        return point, there, left, count + 1
+
+    def unfinished(carry: tuple) -> Array:
+        _, _, left, count = carry
+        return (left > tolerance) & (count < _MAX_STEPS)
+
+    first = jnp.clip(start, -LIMIT, LIMIT)
+    expansion = expand(first)
+    begun = (first, expansion, residual(expansion[1], first), jnp.zeros((), int))
+    logits, (_, gradient, _), _, count = lax.while_loop(unfinished, improve, begun)
+    total = jnp.sum(weights[0]) + jnp.sum(weights[1]) + statistic.right
+    agreement = (gradient + matches + statistic.right) / jnp.where(statistic.size > 0, total, jnp.nan)
+    return SensorFit(logits, agreement, count)
+
+
+def agreement_of(classes: ReportClasses, logits: Float[Array, " J"], statistic: ReportStatistic) -> Any:
+    """Expected agreement ``[J]`` of reports with truths that occurred as the statistic says."""
+    expected = statistic.right
+    for weight, counts in (
+        (statistic.plain.sum(1), jnp.broadcast_to(classes.reportable, classes.others.shape)),
+        (statistic.wrong.sum(1), classes.others),
+    ):
+        _, share = _log_partitions(classes, logits, counts)
+        expected = expected + jnp.einsum("c,co,coj->j", weight, share, classes.agree)
+    total = jnp.sum(statistic.plain) + jnp.sum(statistic.wrong) + statistic.right
+    return expected / jnp.where(statistic.size > 0, total, jnp.nan)
