@@ -35,7 +35,7 @@ class NoisyProblem(NamedTuple):
     """Arguments of :func:`noisy_behaviour_model`, identical trajectories gathered."""
 
     mdp: TabularMDP
-    predicates: Bool[Array, "J S A"]
+    predicates: Bool[Array, "J S A"] | Int[Array, "J S A"]
     reportable: Bool[Array, "S A"]
     view: Sensor
     codes: Int[Array, "u L 3"]

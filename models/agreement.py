@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
 
-from .evidence import FeatureNoise
+from .evidence import FeatureNoise, checked_predicates
 
 
 class PredicateClasses(NamedTuple):
@@ -16,7 +16,7 @@ class PredicateClasses(NamedTuple):
 
     Fields
     ------
-    vectors : bool ``[C, J]``
+    vectors : bool or int ``[C, J]``
         Values of the predicates in each class.
     reportable : float ``[C]``
         How many pairs of each class perception may report.
@@ -24,7 +24,7 @@ class PredicateClasses(NamedTuple):
         The class of each pair.
     """
 
-    vectors: Bool[np.ndarray, "C J"]
+    vectors: Bool[np.ndarray, "C J"] | Int[np.ndarray, "C J"]
     reportable: Float[np.ndarray, " C"]
     of_pair: Int[np.ndarray, "S A"]
 
@@ -35,17 +35,26 @@ class PredicateClasses(NamedTuple):
 
     def gather(self, weights: ArrayLike) -> Float[np.ndarray, " C"]:
         """Weights of pairs ``[S, A]`` as weights of classes, of sum one; ``ValueError`` if they cannot."""
+        w = self.checked(weights)
+        return self.sum(w) / w.sum()
+
+    def sum(self, weights: Float[np.ndarray, "S A"]) -> Float[np.ndarray, " C"]:
+        """Weights of pairs, summed in each class."""
+        return np.bincount(self.of_pair.ravel(), weights.ravel(), len(self.vectors))
+
+    def checked(self, weights: ArrayLike, zero: bool = False) -> Float[np.ndarray, "S A"]:
+        """Weights of pairs; ``ValueError`` if negative or not finite, or all zero unless ``zero``."""
         w = np.asarray(weights, float)
         if w.shape != self.of_pair.shape:
             raise ValueError(
                 f"weights of truths have shape [S, A] = {list(self.of_pair.shape)}, got {list(w.shape)}"
             )
-        if not (np.isfinite(w) & (w >= 0)).all() or not w.sum() > 0:
+        if not (np.isfinite(w) & (w >= 0)).all() or not (zero or w.sum() > 0):
             raise ValueError(
                 f"weights of truths must be finite, not negative and not all zero; the least is {w.min()}, "
                 f"their sum {w.sum()}"
             )
-        return np.bincount(self.of_pair.ravel(), w.ravel(), len(self.vectors)) / w.sum()
+        return w
 
 
 def predicate_classes(predicates: ArrayLike, reportable: ArrayLike | None = None) -> PredicateClasses:
@@ -96,16 +105,17 @@ def reported_matches(
 
     Parameters
     ----------
-    predicates : bool ``[J, S, A]``
+    predicates : bool or int ``[J, S, A]``
     states, actions : int ``[T]``
         The pairs reported.
     posterior : float ``[T, S, A]``
         Of the truth behind each report. A point at the true pair gives the ``oracle`` of the sources, one at
         the report itself ``observed``.
 
-    Raises ``ValueError`` for shapes that do not fit, indices out of range, or a posterior that is none.
+    Raises ``ValueError`` for bad predicates, shapes that do not fit, indices out of range, or a posterior
+    that is none.
     """
-    psi, truth = np.asarray(predicates, bool), np.asarray(posterior, float)
+    psi, truth = checked_predicates(predicates), np.asarray(posterior, float)
     s, a = np.asarray(states), np.asarray(actions)
     if s.ndim != 1 or a.shape != s.shape or truth.shape != (len(s), *psi.shape[1:]):
         raise ValueError(
@@ -121,5 +131,6 @@ def reported_matches(
     if wrong.any():
         t = int(np.flatnonzero(wrong)[0])
         raise ValueError(f"the posterior of report {t} is no distribution: it sums to {total[t]}")
-    true = np.einsum("tsa,jsa->tj", truth, psi.astype(float), optimize=True)
-    return ReportedMatches(truth.sum(0), np.where(psi[:, s, a].T, true, 1 - true).sum(0))
+    # One predicate at a time: who agrees with whom is [T, S, A].
+    same = (labels == labels[s, a][:, None, None] for labels in psi)
+    return ReportedMatches(truth.sum(0), np.array([truth[which].sum() for which in same]))

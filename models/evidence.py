@@ -13,6 +13,7 @@ from typing import NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from .demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
@@ -161,7 +162,7 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
 
 
 class _NoiseFields(NamedTuple):
-    predicates: Bool[Array, "J S A"]
+    predicates: Bool[Array, "J S A"] | Int[Array, "J S A"]
     reliabilities: Float[Array, " J"]
     reportable: Bool[Array, "S A"]
 
@@ -175,8 +176,9 @@ class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
 
     Parameters
     ----------
-    predicates : bool ``[J, S, A]``
-        ``psi_j(s, a)``.
+    predicates : bool or int ``[J, S, A]``
+        ``psi_j(s, a)``. A predicate may be a label, such as the state's index: what counts is whether two
+        pairs have the same value.
     reliabilities : float ``[J]``
         ``p_j``, between 0 and 1; one half says nothing about its predicate.
     reportable : bool ``[S, A]``, optional
@@ -186,7 +188,8 @@ class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
     Raises
     ------
     ValueError
-        For predicates that are not true or false, reliabilities outside (0, 1), or shapes that do not fit.
+        For predicates that are neither true or false nor whole numbers, reliabilities outside (0, 1), or
+        shapes that do not fit.
     """
 
     __slots__ = ()
@@ -202,7 +205,7 @@ class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
             reportable = np.ones(np.shape(predicates)[1:], bool)
         # Only what a user would write is checked: JAX rebuilds this tuple around its own placeholders.
         if isinstance(predicates, np.ndarray | list | tuple):
-            predicates = jnp.asarray(_checked_predicates(predicates))
+            predicates = jnp.asarray(checked_predicates(predicates))
         if isinstance(reliabilities, np.ndarray | list | tuple):
             p = np.asarray(reliabilities, dtype=float)
             if p.shape != predicates.shape[:1]:
@@ -237,30 +240,52 @@ class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
     def log_probabilities(self) -> Float[Array, "S A S A"]:
         """``log O(o | g)``, truth first; ``-inf`` for what cannot be reported."""
         n_predicates, *pairs = self.predicates.shape
-        psi = self.predicates.reshape(n_predicates, -1).astype(float)
+        psi = self.predicates.reshape(n_predicates, -1)
         logits = jnp.log(self.reliabilities) - jnp.log1p(-self.reliabilities)
         # Up to a term that no o changes: sum_j logit_j [psi_j(o) = psi_j(g)].
-        both = (psi * logits[:, None]).T @ psi
-        neither = ((1 - psi) * logits[:, None]).T @ (1 - psi)
-        table = jnp.where(self.reportable.reshape(-1), both + neither, -jnp.inf)
+        if psi.dtype == bool:
+            true, false = psi.astype(float), (~psi).astype(float)
+            exponents = (true * logits[:, None]).T @ true + (false * logits[:, None]).T @ false
+        else:
+            exponents = _same_labels(psi, logits)
+        table = jnp.where(self.reportable.reshape(-1), exponents, -jnp.inf)
         return jax.nn.log_softmax(table, axis=1).reshape(*pairs, *pairs)
 
     def agreement(self) -> Float[Array, "J S A"]:
         """Probability that each predicate of a report is that of the truth ``(s, a)``."""
-        n_predicates, *pairs = self.predicates.shape
-        psi = self.predicates.reshape(n_predicates, -1).astype(float)
-        size = psi.shape[1]
-        true = psi @ jnp.exp(self.log_probabilities.reshape(size, size)).T
-        return jnp.where(self.predicates.reshape(n_predicates, -1), true, 1 - true).reshape(-1, *pairs)
+        psi = self.predicates.reshape(self.predicates.shape[0], -1)
+        table = jnp.exp(self.log_probabilities).reshape(psi.shape[1], -1)
+        same = jax.lax.map(lambda labels: jnp.sum(table, 1, where=labels[:, None] == labels), psi)
+        return same.reshape(self.predicates.shape)
 
 
-def _checked_predicates(predicates: np.ndarray | list | tuple) -> Bool[np.ndarray, "J S A"]:
+def _same_labels(psi: Int[Array, "J SA"], logits: Float[Array, " J"]) -> Float[Array, "SA SA"]:
+    """``sum_j logit_j [psi_j(o) = psi_j(g)]``, one predicate at a time, in its derivative too."""
+
+    # Kept for a derivative, who agrees with whom would be [J, SA, SA].
+    @jax.checkpoint
+    def add(total: Array, one: tuple[Array, Array]) -> tuple[Array, None]:
+        labels, logit = one
+        return total + jnp.where(labels[:, None] == labels, logit, 0.0), None
+
+    return jax.lax.scan(add, jnp.zeros((psi.shape[1], psi.shape[1])), (psi, logits))[0]
+
+
+def checked_predicates(predicates: ArrayLike) -> Bool[np.ndarray, "J S A"] | Int[np.ndarray, "J S A"]:
+    """Predicates as booleans if they are true or false, else as whole numbers; ``ValueError`` otherwise."""
     psi = np.asarray(predicates)
     if psi.ndim != 3 or not psi.size:
         raise ValueError(f"predicates have shape [J, S, A], got {list(psi.shape)}")
-    if not np.isin(psi, (0, 1)).all():
-        raise ValueError("predicates are true or false at every pair")
-    return psi.astype(bool)
+    if psi.dtype.kind not in "biuf":
+        raise ValueError(f"predicates are true or false, or whole numbers; got entries of type {psi.dtype}")
+    broken = ~np.isfinite(psi) | (psi != np.rint(psi)) if psi.dtype.kind == "f" else np.zeros(psi.shape, bool)
+    if broken.any():
+        j, s, a = np.argwhere(broken)[0]
+        raise ValueError(
+            f"predicates are true or false, or whole numbers; predicate {j} of the pair ({s}, {a}) "
+            f"is {psi[j, s, a]}"
+        )
+    return psi.astype(bool) if np.isin(psi, (0, 1)).all() else psi.astype(int)
 
 
 def require_fitting(sensor: Imperfection, mdp: TabularMDP) -> None:

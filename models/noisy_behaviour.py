@@ -49,7 +49,7 @@ def reliabilities_prior(n_predicates: int, prior: dist.Distribution | None = Non
 
 def noisy_behaviour_model(
     mdp: TabularMDP,
-    predicates: Bool[Array, "J S A"],
+    predicates: Bool[Array, "J S A"] | Int[Array, "J S A"],
     codes: Int[Array, "n L 3"] | None = None,
     *,
     view: Imperfection | None = None,
@@ -69,7 +69,8 @@ def noisy_behaviour_model(
     Parameters
     ----------
     mdp
-    predicates : bool ``[J, S, A]``
+    predicates : bool or int ``[J, S, A]``
+        Labels such as the state's index included, as in ``FeatureNoise``.
     codes : int ``[n, L, 3]``, optional
         What was perceived, :attr:`Demonstration.codes` (scores are not part of the event). Without it the
         model simulates, as :func:`occlusion_model` does.

@@ -48,7 +48,7 @@ def observation_feature_model(
 
     Parameters
     ----------
-    predicates : bool ``[J, S, A]``
+    predicates : bool or int ``[J, S, A]``
     reported : ReportedMatches
         Of all sessions so far; their counts add up.
     scores : float ``[n]``, optional

@@ -51,10 +51,12 @@ def evidence_by_hand(codes, predicates, reliabilities, reportable, view):
         return np.log(evidence)
 
 
-@pytest.mark.parametrize("hides", [False, True])
+@pytest.mark.parametrize(("hides", "labelled"), [(False, False), (True, False), (True, True)])
 def test_the_density_is_that_of_enumeration(
-    toy, predicates, hides, imperfect_demonstration, enumerate_completions
+    toy, predicates, hides, labelled, imperfect_demonstration, enumerate_completions
 ):
+    if labelled:
+        predicates = np.stack([*predicates[:2], np.tile(np.arange(3)[:, None], 2)])
     rng = np.random.default_rng(int(hides))
     weights, p = rng.normal(size=2), rng.uniform(0.1, 0.95, 3)
     reportable = np.array([[1, 1], [1, 0], [1, 1]], bool)

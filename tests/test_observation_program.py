@@ -214,6 +214,30 @@ def test_matches_of_reports_with_a_posterior():
     np.testing.assert_allclose(reported_matches(predicates, states, actions, observed).agreement, 1)
 
 
+def test_labels_gather_and_match_by_their_values():
+    predicates, _, weights, reportable = random_problem(9, n_predicates=2, shape=(10, 4), hidden=0.5)
+    rng = np.random.default_rng(2)
+    features = np.concatenate([predicates, np.broadcast_to(rng.integers(-1, 3, (10, 1)), (1, 10, 4))])
+    classes = predicate_classes(features, reportable)
+    np.testing.assert_array_equal(classes.vectors[classes.of_pair], np.moveaxis(features, 0, -1))
+    assert len(classes.vectors) == len(np.unique(features.reshape(3, -1), axis=1).T)
+    states, actions = rng.integers(10, size=6), rng.integers(4, size=6)
+    posterior = rng.dirichlet(weights.ravel() + 0.1, 6).reshape(6, 10, 4)
+    by_hand = np.zeros(3)
+    for t, s, a in np.ndindex(6, 10, 4):
+        by_hand += posterior[t, s, a] * (features[:, s, a] == features[:, states[t], actions[t]])
+    np.testing.assert_allclose(reported_matches(features, states, actions, posterior).matches, by_hand)
+
+
+def test_reliabilities_of_labels_are_recovered_from_exact_agreement():
+    predicates, _, weights, reportable = random_problem(12, n_predicates=2, shape=(8, 4), hidden=0.2)
+    features = np.concatenate([predicates, np.broadcast_to(np.arange(8)[:, None], (1, 8, 4))])
+    p = np.array([0.7, 0.8, 0.995])
+    target = expected_agreement(features, p, weights, reportable)
+    solution = ObservationProgram(features, reportable).solve(weights, target)
+    np.testing.assert_allclose(solution.reliabilities, p, atol=1e-6)
+
+
 def test_bad_input_is_refused_in_its_own_terms():
     predicates, _, weights, _ = random_problem(1)
     program = ObservationProgram(predicates)
@@ -231,7 +255,7 @@ def test_bad_input_is_refused_in_its_own_terms():
     with pytest.raises(ValueError, match=r"predicates have shape \[J, S, A\]"):
         ObservationProgram(predicates[0])
     with pytest.raises(ValueError, match="true or false"):
-        unidentified_predicates(2 * predicates)
+        unidentified_predicates(0.5 * predicates)
     with pytest.raises(ValueError, match="limit of 3 logits"):
         ObservationProgram(predicates, limit=300.0)
     with pytest.raises(ValueError, match="report 1 is of the pair"):
