@@ -35,6 +35,7 @@ from ..models.evidence import (
     ObservationModel,
     Sensor,
     Visibility,
+    checked_predicates,
     observe,
     require_fitting,
 )
@@ -52,6 +53,9 @@ SORTING_PREDICATES = (
     "hand to bin", "onion to table", "hand to table",
 )  # fmt: skip
 PATROL_PREDICATES = ("move forward", "turn left", "in the top row", "turn right")
+
+SORTING_LABELS = ("onion location", "hand location")
+PATROL_LABELS = ("state",)
 
 SWAP = 0.3
 CONCENTRATION = 4.0
@@ -88,6 +92,17 @@ def patrol_predicates(patrol: patrols.Patrol) -> Bool[np.ndarray, "4 S A"]:
     return _stacked(action == patrols.FORWARD, action == patrols.LEFT, row == 0, action == patrols.RIGHT)
 
 
+def sorting_labels(sorting: onions.Sorting) -> Int[np.ndarray, "2 S A"]:
+    """Where the onion and the hand are, in the codes of ``sorting.factors``."""
+    places = np.asarray(sorting.factors)[:, [0, 2]].T
+    return np.tile(places[..., None], sorting.mdp.n_actions)
+
+
+def patrol_labels(patrol: patrols.Patrol) -> Int[np.ndarray, "1 S A"]:
+    """The state's index."""
+    return np.tile(np.arange(patrol.mdp.n_states)[None, :, None], patrol.mdp.n_actions)
+
+
 def _stacked(*predicates: Bool[np.ndarray, "..."]) -> Bool[np.ndarray, "J S A"]:
     return np.stack(np.broadcast_arrays(*predicates))
 
@@ -111,6 +126,9 @@ class NoisyTask(NamedTuple):
     predicates : bool ``[J, S, A]``
     noise : SwapNoise
         The noise of the simulation.
+    label_names : tuple of str ``[M]``
+    labels : int ``[M, S, A]``
+        Parts of a pair that the noise does not touch; see :attr:`features`.
     """
 
     name: str
@@ -120,6 +138,23 @@ class NoisyTask(NamedTuple):
     predicate_names: tuple[str, ...]
     predicates: Bool[np.ndarray, "J S A"]
     noise: SwapNoise
+    label_names: tuple[str, ...]
+    labels: Int[np.ndarray, "M S A"]
+
+    @property
+    def features(self) -> Int[np.ndarray, "J+M S A"]:
+        """Predicates and labels: all that perception can get right or wrong.
+
+        The dissertation's predicates leave most of a pair open, and a model of nothing else has states that
+        they do not tell apart reported at random. Nobody tells the learner that labels are clear: their
+        reliabilities are learned, too.
+        """
+        return np.concatenate([self.predicates.astype(int), self.labels])
+
+    @property
+    def feature_names(self) -> tuple[str, ...]:
+        """Of :attr:`features`."""
+        return self.predicate_names + self.label_names
 
     def starting(self, starts: Starts) -> TabularMDP:
         """The process begun anywhere (``"all"``, uniformly) or where it ``"natural"``ly is.
@@ -166,6 +201,7 @@ def noisy_sorting(
         "noisy " + sorting.name, sorting.mdp, sorting.weights[0], sorting.expert_policy(0),
         SORTING_PREDICATES, sorting_predicates(sorting),
         SwapNoise(np.stack(swaps), np.array([prediction_noise, place_noise])),
+        SORTING_LABELS, sorting_labels(sorting),
     )  # fmt: skip
 
 
@@ -181,7 +217,7 @@ def noisy_patrol(noise: float = SWAP) -> NoisyTask:
     swap = _flat(mdp, actions=_exchanged(mdp, patrols.FORWARD, patrols.RIGHT))
     return NoisyTask(
         "noisy patrol", mdp, patrol.weights, policy, PATROL_PREDICATES, patrol_predicates(patrol),
-        SwapNoise(swap[None], np.array([noise])),
+        SwapNoise(swap[None], np.array([noise])), PATROL_LABELS, patrol_labels(patrol),
     )  # fmt: skip
 
 
@@ -229,14 +265,15 @@ def agreement_probabilities(
 ) -> Float[np.ndarray, " J"]:
     """Probability that a predicate of a report is that of the truth, when truths occur as ``weights [S, A]``.
 
-    Exact, by summing over reports; ``weights`` need not be normalised. This is what an estimated sensor is
-    judged by: the reliabilities of :class:`FeatureNoise` are parameters, not frequencies. Raises
-    ``ValueError`` for noise without an observation model, or weights that are no distribution over its pairs.
+    ``predicates [J, S, A]`` may be labels. Exact, by summing over reports; ``weights`` need not be
+    normalised. This is what an estimated sensor is judged by: the reliabilities of :class:`FeatureNoise` are
+    parameters, not frequencies. Raises ``ValueError`` for noise without an observation model, bad predicates,
+    or weights that are no distribution over its pairs.
     """
     model = _reading(noise)
     table = np.exp(np.asarray(model.log_probabilities))
-    psi, share = np.asarray(predicates, bool), np.asarray(weights, float)
-    if psi.ndim != 3 or psi.shape[1:] != table.shape[:2] or share.shape != table.shape[:2]:
+    psi, share = checked_predicates(predicates), np.asarray(weights, float)
+    if psi.shape[1:] != table.shape[:2] or share.shape != table.shape[:2]:
         raise ValueError(
             f"the noise is about pairs [S, A] = {list(table.shape[:2])}, but predicates [J, S, A] have shape "
             f"{list(psi.shape)} and weights [S, A] have shape {list(share.shape)}"
@@ -245,9 +282,10 @@ def agreement_probabilities(
         raise ValueError("weights of pairs must be non-negative numbers, not all zero")
     size = share.size
     psi, share = psi.reshape(len(psi), size), share.reshape(size) / share.sum()
-    true = psi @ table.reshape(size, size).T
+    together = share[:, None] * table.reshape(size, size)
+    same = np.array([together[labels[:, None] == labels].sum() for labels in psi])
     # Rounding may lead past one.
-    return np.clip(np.where(psi, true, 1 - true) @ share, 0.0, 1.0)
+    return np.clip(same, 0.0, 1.0)
 
 
 def _reading(noise: Imperfection) -> ObservationModel:

@@ -95,6 +95,26 @@ def test_patrol_predicates_say_what_their_names_say_and_none_is_constant() -> No
     assert not any(state.column == 0 for state in states)
 
 
+@pytest.mark.parametrize("name", TASKS)
+def test_labels_are_untouched_by_the_noise_and_features_hold_them(name: str) -> None:
+    task = TASKS[name]()
+    np.testing.assert_allclose(
+        agreement_probabilities(task.noise, task.labels, np.ones(task.labels.shape[1:])), 1
+    )
+    n_predicates = len(task.predicates)
+    assert len(task.feature_names) == len(task.features) == n_predicates + len(task.labels)
+    np.testing.assert_array_equal(task.features[:n_predicates], task.predicates)
+    np.testing.assert_array_equal(task.features[n_predicates:], task.labels)
+
+
+def test_labels_say_where_things_are() -> None:
+    onion, hand = sorting_task().labels
+    digits = np.array([[int(d) for d in s] for s in states_22()])
+    np.testing.assert_array_equal(onion, np.tile(digits[:, [0]], 7))
+    np.testing.assert_array_equal(hand, np.tile(digits[:, [2]], 7))
+    np.testing.assert_array_equal(patrol_task().labels[0], np.indices((124, 4))[0])
+
+
 # -- noise --------------------------------------------------------------------------------------------
 
 
@@ -151,7 +171,7 @@ def test_agreement_probabilities_are_those_of_enumeration() -> None:
     task = sorting_task()
     weights = np.random.default_rng(0).random((22, 7))
     for noise in (task.noise, feature_noise(task)):
-        table, psi = table_of(noise), task.predicates
+        table, psi = table_of(noise), task.features
         expected = [
             sum(
                 weights[s, a] * table[s, a, t, b] * (psi[j, s, a] == psi[j, t, b])
@@ -159,10 +179,10 @@ def test_agreement_probabilities_are_those_of_enumeration() -> None:
                 if table[s, a, t, b] > 1e-12
             )
             / weights.sum()
-            for j in (0, 3, 4)
+            for j in (0, 3, 4, 8)
         ]
         np.testing.assert_allclose(
-            agreement_probabilities(noise, psi, weights)[[0, 3, 4]], expected, atol=1e-10
+            agreement_probabilities(noise, psi, weights)[[0, 3, 4, 8]], expected, atol=1e-10
         )
 
 
