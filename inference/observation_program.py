@@ -26,7 +26,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 from scipy.sparse import csgraph
 
-from ..models.agreement import PredicateClasses, predicate_classes
+from ..models.agreement import PredicateClasses, agreement_patterns, predicate_classes
 from .maxent_constraints import ProgramNotSolved
 from .maxent_dual import _COLD, _WARM, IpoptPoint
 
@@ -85,11 +85,9 @@ class _Choices(NamedTuple):
 def _choices(classes: PredicateClasses) -> _Choices:
     said = classes.reportable > 0
     agree = classes.agreements[:, said]
-    n_classes, n_reports, n_predicates = agree.shape
-    patterns, which = np.unique(agree.reshape(-1, n_predicates), axis=0, return_inverse=True)
-    of_any = np.zeros((n_classes, len(patterns)))
-    of_truth = np.arange(n_classes)[:, None]
-    np.add.at(of_any, (of_truth, which.reshape(n_classes, n_reports)), classes.reportable[said])
+    patterns, which = agreement_patterns(agree)
+    of_any = np.zeros((len(agree), len(patterns)))
+    np.add.at(of_any, (np.arange(len(agree))[:, None], which), classes.reportable[said])
     of_others = of_any - np.outer(said, patterns.all(1))
     return _Choices(patterns, of_any, of_others)
 

@@ -11,7 +11,7 @@ asked for. An unscored report follows ``O(o | g)`` itself. Both share one set of
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,9 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
+from ..models.agreement import agreement_patterns
 from ..models.demonstration import HIDDEN, SEEN, UNKNOWN, Demonstration
+from ..models.evidence import FeatureNoise
 from .maxent import quadratic_l1
 
 # A perception that is certain may still be wrong: a score of one would rule out every other truth.
@@ -30,6 +32,7 @@ LIMIT = 12.0
 
 _MAX_STEPS = 30
 _MAX_HALVINGS = 20
+_MAX_SWEEPS = 50
 
 
 class ReportClasses(NamedTuple):
@@ -39,6 +42,12 @@ class ReportClasses(NamedTuple):
     ------
     agree : float ``[C, C, J]``
         Whether each predicate of a truth (first) is that of a report (second).
+    patterns : float ``[E, J]``
+        Rows of ``agree`` that occur.
+    pattern : int ``[C, C]``
+        Which of them.
+    choices : float ``[C, E]``
+        Number of pairs that can be reported and agree so with a truth.
     reportable : float ``[C]``
         Number of pairs of each class that perception may report: all of a class, or none.
     of_pair : int ``[S, A]``
@@ -48,27 +57,45 @@ class ReportClasses(NamedTuple):
     """
 
     agree: Float[Array, "C C J"]
+    patterns: Float[Array, "E J"]
+    pattern: Int[Array, "C C"]
+    choices: Float[Array, "C E"]
     reportable: Float[Array, " C"]
     of_pair: Int[Array, "S A"]
     members: Float[Array, "SA C"]
     can_be_reported: Bool[Array, "S A"]
 
     @property
-    def others(self) -> Float[Array, "C C"]:
-        """How many pairs of each class (second) could be reported wrongly of a truth in each (first)."""
-        return self.reportable - jnp.diag((self.reportable > 0).astype(float))
+    def wrong_choices(self) -> Float[Array, "C E"]:
+        """As ``choices``, of the pairs other than the truth."""
+        return self.choices - (self.reportable > 0)[:, None] * jnp.all(self.patterns == 1, axis=1)
+
+    @property
+    def certain(self) -> Float[Array, "S A"]:
+        """Whether a scored report is right, one or zero, where it could not be otherwise; else NaN."""
+        alone = self.can_be_reported & (jnp.sum(self.reportable) == 1)
+        return jnp.where(self.can_be_reported, jnp.where(alone, 1.0, jnp.nan), 0.0)
 
 
 def report_classes(predicates: ArrayLike, reportable: ArrayLike | None = None) -> ReportClasses:
     """Gather the pairs ``[S, A]``; arguments and errors as of :class:`~i2rl.models.FeatureNoise`."""
-    psi = np.asarray(predicates)
-    mask = np.ones(psi.shape[1:], bool) if reportable is None else np.asarray(reportable, bool)
+    psi, mask = np.asarray(predicates), None if reportable is None else np.asarray(reportable)
+    noise = FeatureNoise(psi, np.full(psi.shape[:1], 0.5), mask)
+    psi, mask = np.asarray(noise.predicates), np.asarray(noise.reportable)
     keys = np.concatenate([psi.astype(int), mask[None]]).reshape(len(psi) + 1, -1).T
     vectors, of_pair = np.unique(keys, axis=0, return_inverse=True)
     of_pair = of_pair.reshape(mask.shape)
+    agree = vectors[:, None, :-1] == vectors[None, :, :-1]
+    number = np.bincount(of_pair[mask], minlength=len(vectors)).astype(float)
+    patterns, pattern = agreement_patterns(agree)
+    choices = np.zeros((len(vectors), len(patterns)))
+    np.add.at(choices, (np.arange(len(vectors))[:, None], pattern), number)
     return ReportClasses(
-        jnp.asarray((vectors[:, None, :-1] == vectors[None, :, :-1]).astype(float)),
-        jnp.asarray(np.bincount(of_pair[mask], minlength=len(vectors)).astype(float)),
+        jnp.asarray(agree.astype(float)),
+        jnp.asarray(patterns),
+        jnp.asarray(pattern),
+        jnp.asarray(choices),
+        jnp.asarray(number),
         jnp.asarray(of_pair),
         jax.nn.one_hot(of_pair.ravel(), len(vectors), dtype=float),
         jnp.asarray(mask),
@@ -92,10 +119,10 @@ class SensorTables(NamedTuple):
 
 def sensor_tables(classes: ReportClasses, logits: Float[Array, " J"]) -> SensorTables:
     """The tables of reliabilities ``p_j`` with these logits."""
-    exponents = classes.agree @ logits
-    likelihoods = jnp.exp(exponents - exponents.max(1, keepdims=True))
-    total = likelihoods @ classes.reportable
-    others = jnp.sum(likelihoods * classes.others, axis=1)
+    exponents = classes.patterns @ logits
+    terms = jnp.exp(exponents - exponents.max())
+    likelihoods = terms[classes.pattern]
+    total, others = classes.choices @ terms, classes.wrong_choices @ terms
     possible = others > 0
     wrong = likelihoods / jnp.where(possible, others, 1.0)[:, None]
     return SensorTables(likelihoods / total[:, None], jnp.where(possible[:, None], wrong, 0.0))
@@ -153,6 +180,7 @@ class _Likelihood(NamedTuple):
     plain: Float[Array, "n L C"]
     right: Float[Array, "n L S A"]
     wrong: Float[Array, "n L S A"]
+    confidence: Float[Array, "... S A"]
     scored: Bool[Array, "n L S A"]
     total: Float[Array, "n L S A"]
 
@@ -165,14 +193,14 @@ def _likelihood(
 ) -> _Likelihood:
     """Of every step and truth; ``confidence`` that a report is right given the truth, NaN for none."""
     scored = jnp.broadcast_to(~jnp.isnan(confidence), reports.same.shape)
-    c = jnp.where(scored, confidence, 0.0)
+    c = jnp.where(jnp.isnan(classes.certain), jnp.where(scored, confidence, 0.0), classes.certain)
     plain = reports.said @ tables.plain.T
     itself = jnp.diag(tables.wrong)[classes.of_pair]
     others = (reports.said @ tables.wrong.T)[..., classes.of_pair]
     right = c * reports.same
     wrong = (1 - c) * jnp.maximum(others - reports.same * itself, 0.0)
     return _Likelihood(
-        plain, right, wrong, scored, jnp.where(scored, right + wrong, plain[..., classes.of_pair])
+        plain, right, wrong, c, scored, jnp.where(scored, right + wrong, plain[..., classes.of_pair])
     )
 
 
@@ -189,7 +217,8 @@ def report_log_evidence(
     ----------
     classes, logits, reports
     confidence : float ``[S, A]`` or ``[n, L, S, A]``
-        Probability that the report is right if the truth is ``(s, a)``; NaN where there are no scores.
+        Probability that the report is right if the truth is ``(s, a)``; NaN where there are no scores. Of a
+        truth that cannot be reported no report is right, whatever is said here.
     presence : float ``[S]``, optional
         Probability of being in view; everything is, by default.
     """
@@ -274,7 +303,7 @@ def report_statistic(
     share = jnp.where(possible, mass / jnp.where(possible, parts.total, 1.0), 0.0)
     right = share * parts.right
     # Wrong reports, as if the report could be anything it says, less the truth itself.
-    blame = share * (1 - jnp.where(parts.scored, confidence, 0.0))
+    blame = share * (1 - parts.confidence)
     by_class = blame.reshape(*mass.shape[:2], -1) @ classes.members
     itself = (blame * reports.same).sum((0, 1)).reshape(-1) @ classes.members
     wrong = (jnp.einsum("nlc,nlo->co", by_class, reports.said) - jnp.diag(itself)) * tables.wrong
@@ -310,13 +339,81 @@ class SensorFit(NamedTuple):
     iterations: Int[Array, ""]
 
 
-def _log_partitions(
-    classes: ReportClasses, logits: Float[Array, " J"], counts: Float[Array, "C C"]
-) -> tuple[Float[Array, " C"], Float[Array, "C C"]]:
-    """``log sum_o counts exp(logits.agree)`` and the distribution over classes of reports."""
-    log_counts = jnp.where(counts > 0, jnp.log(jnp.where(counts > 0, counts, 1.0)), -1e300)
-    terms = classes.agree @ logits + log_counts
-    return jax.nn.logsumexp(terms, axis=1), jax.nn.softmax(terms, axis=1)
+def _moments(
+    classes: ReportClasses, statistic: ReportStatistic, logits: Float[Array, " J"]
+) -> tuple[Float[Array, ""], Float[Array, " J"], Float[Array, "J J"]]:
+    """``sum_g plain_g log Z_g + sum_g wrong_g log Z'_g``, its gradient (agreement) and its curvature."""
+    exponents = classes.patterns @ logits
+    highest = exponents.max()
+    terms = jnp.exp(exponents - highest)
+    value, mean = jnp.zeros(()), jnp.zeros(len(logits))
+    curvature = jnp.zeros((len(logits), len(logits)))
+    for table, choices in (
+        (statistic.plain, classes.choices),
+        (statistic.wrong, classes.wrong_choices),
+    ):
+        # A truth with nothing to choose from has no weight.
+        total = choices @ terms
+        weight, total = jnp.where(total > 0, table.sum(1), 0.0), jnp.where(total > 0, total, 1.0)
+        share = choices * terms / total[:, None]
+        means = share @ classes.patterns
+        value += weight @ (jnp.log(total) + highest)
+        mean += weight @ means
+        curvature += (classes.patterns.T * (weight @ share)) @ classes.patterns - (means.T * weight) @ means
+    return value, mean, curvature
+
+
+def _quadratic_in_box(
+    curvature: Float[Array, "J J"],
+    slope: Float[Array, " J"],
+    slack: Float[Array, " J"],
+    origin: Float[Array, " J"],
+    tolerance: float,
+) -> Float[Array, " J"]:
+    """As :func:`.maxent.quadratic_l1`, with weights in ``[-LIMIT, LIMIT]``; ``origin`` is there.
+
+    What is held at a limit is guessed and the others solved for; a sweep of coordinate descent corrects the
+    guess.
+    """
+    damping = 1e-8 * jnp.max(jnp.diag(curvature)) + 1e-200
+    damped = curvature + damping * jnp.eye(len(slope))
+
+    def value(w: Array) -> Array:
+        move = w - origin
+        return slope @ move + 0.5 * move @ (damped @ move) + slack @ jnp.abs(w)
+
+    def coordinate(k: Array, w: Array) -> Array:
+        free = w[k] - (slope[k] + damped[k] @ (w - origin)) / damped[k, k]
+        shrunk = jnp.sign(free) * jnp.maximum(jnp.abs(free) - slack[k] / damped[k, k], 0.0)
+        return w.at[k].set(jnp.clip(shrunk, -LIMIT, LIMIT))
+
+    def improve(carry: tuple) -> tuple:
+        w, _, count = carry
+        gradient = slope + damped @ (w - origin)
+        held = (jnp.abs(w) >= LIMIT) & (gradient * jnp.sign(w) + slack <= 0)
+        block = jnp.where(held[:, None] | held, jnp.eye(len(slope)), curvature)
+        pull = jnp.where(held, 0.0, slope + damped @ jnp.where(held, w - origin, 0.0))
+        aim = quadratic_l1(
+            block, pull, jnp.where(held, 0.0, slack), jnp.where(held, w, origin), jnp.asarray(tolerance)
+        )
+        aim = jnp.clip(aim, -LIMIT, LIMIT)
+        w = jnp.where(value(aim) <= value(w), aim, w)
+        left = _residual(slope + damped @ (w - origin), slack, w)
+        w = lax.cond(left > tolerance, lambda w: lax.fori_loop(0, len(slope), coordinate, w), lambda w: w, w)
+        return w, left, count + 1
+
+    def unfinished(carry: tuple) -> Array:
+        _, left, count = carry
+        return (left > tolerance) & (count < _MAX_SWEEPS)
+
+    return lax.while_loop(unfinished, improve, (origin, jnp.array(jnp.inf), 0))[0]
+
+
+def _residual(gradient: Array, slack: Array, logits: Array) -> Array:
+    """Zero where no step within the limits would help."""
+    step = logits - gradient
+    step = jnp.sign(step) * jnp.maximum(jnp.abs(step) - slack, 0.0)
+    return jnp.max(jnp.abs(jnp.clip(step, -LIMIT, LIMIT) - logits))
 
 
 def fit_sensor(
@@ -333,33 +430,16 @@ def fit_sensor(
     over the pairs other than the truth. ``slack`` is how far the expected agreement may be from the
     statistic's; one error in a hundred reports is a slack of 0.01. Logits stay within ``LIMIT``.
     """
-    full = jnp.broadcast_to(classes.reportable, classes.others.shape)
-    weights = statistic.plain.sum(1), statistic.wrong.sum(1)
     matches = jnp.einsum("co,coj->j", statistic.plain + statistic.wrong, classes.agree)
     beta = jnp.broadcast_to(jnp.asarray(slack, float), matches.shape)
 
     def expand(logits: Float[Array, " J"]) -> tuple:
-        value, gradient = -logits @ matches, -matches
-        curvature = jnp.zeros((len(logits), len(logits)))
-        for weight, counts in zip(weights, (full, classes.others), strict=True):
-            log_z, share = _log_partitions(classes, logits, counts)
-            mean = jnp.einsum("co,coj->cj", share, classes.agree)
-            second = jnp.einsum("c,co,coj,cok->jk", weight, share, classes.agree, classes.agree)
-            value += weight @ log_z
-            gradient += weight @ mean
-            curvature += second - jnp.einsum("c,cj,ck->jk", weight, mean, mean)
-        return value + beta @ jnp.abs(logits), gradient, curvature
-
-    def residual(gradient: Array, logits: Array) -> Array:
-        # Zero where no step within the limits would help.
-        step = logits - gradient
-        step = jnp.sign(step) * jnp.maximum(jnp.abs(step) - beta, 0.0)
-        return jnp.max(jnp.abs(jnp.clip(step, -LIMIT, LIMIT) - logits))
+        value, mean, curvature = _moments(classes, statistic, logits)
+        return value - logits @ matches + beta @ jnp.abs(logits), mean - matches, curvature
 
     def improve(carry: tuple) -> tuple:
         logits, (value, gradient, curvature), _, count = carry
-        aim = quadratic_l1(curvature, gradient, beta, logits, jnp.asarray(tolerance / 10))
-        aim = jnp.clip(aim, -LIMIT, LIMIT)
+        aim = _quadratic_in_box(curvature, gradient, beta, logits, tolerance / 10)
 
         def shorter(trial: tuple) -> tuple:
             length, _, _ = trial
@@ -374,7 +454,7 @@ def fit_sensor(
         better = there[0] <= value + 1e-14 * jnp.abs(value)
         point = jnp.where(better, point, logits)
         there = jax.tree.map(lambda a, b: jnp.where(better, a, b), there, (value, gradient, curvature))
-        left = jnp.where(better, residual(there[1], point), 0.0)
+        left = jnp.where(better, _residual(there[1], beta, point), 0.0)
         return point, there, left, count + 1
 
     def unfinished(carry: tuple) -> Array:
@@ -383,21 +463,19 @@ def fit_sensor(
 
     first = jnp.clip(start, -LIMIT, LIMIT)
     expansion = expand(first)
-    begun = (first, expansion, residual(expansion[1], first), jnp.zeros((), int))
+    begun = (first, expansion, _residual(expansion[1], beta, first), jnp.zeros((), int))
     logits, (_, gradient, _), _, count = lax.while_loop(unfinished, improve, begun)
-    total = jnp.sum(weights[0]) + jnp.sum(weights[1]) + statistic.right
-    agreement = (gradient + matches + statistic.right) / jnp.where(statistic.size > 0, total, jnp.nan)
-    return SensorFit(logits, agreement, count)
+    return SensorFit(logits, _share(statistic, gradient + matches), count)
 
 
-def agreement_of(classes: ReportClasses, logits: Float[Array, " J"], statistic: ReportStatistic) -> Any:
+def agreement_of(
+    classes: ReportClasses, logits: Float[Array, " J"], statistic: ReportStatistic
+) -> Float[Array, " J"]:
     """Expected agreement ``[J]`` of reports with truths that occurred as the statistic says."""
-    expected = statistic.right
-    for weight, counts in (
-        (statistic.plain.sum(1), jnp.broadcast_to(classes.reportable, classes.others.shape)),
-        (statistic.wrong.sum(1), classes.others),
-    ):
-        _, share = _log_partitions(classes, logits, counts)
-        expected = expected + jnp.einsum("c,co,coj->j", weight, share, classes.agree)
+    return _share(statistic, _moments(classes, statistic, logits)[1])
+
+
+def _share(statistic: ReportStatistic, mean: Float[Array, " J"]) -> Float[Array, " J"]:
+    """Agreement per report, given that of plain and wrong ones; NaN before any report."""
     total = jnp.sum(statistic.plain) + jnp.sum(statistic.wrong) + statistic.right
-    return expected / jnp.where(statistic.size > 0, total, jnp.nan)
+    return (mean + statistic.right) / jnp.where(statistic.size > 0, total, jnp.nan)

@@ -75,6 +75,15 @@ def predicate_classes(predicates: ArrayLike, reportable: ArrayLike | None = None
     )
 
 
+def agreement_patterns(
+    agreements: Bool[np.ndarray, "C R J"] | Float[np.ndarray, "C R J"],
+) -> tuple[Float[np.ndarray, "E J"], Int[np.ndarray, "C R"]]:
+    """The different rows of agreements on predicates, and which of them each truth and report have."""
+    rows = agreements.reshape(-1, agreements.shape[-1]).astype(bool)
+    _, first, which = np.unique(np.packbits(rows, axis=1), axis=0, return_index=True, return_inverse=True)
+    return rows[first].astype(float), which.reshape(agreements.shape[:-1])
+
+
 class ReportedMatches(NamedTuple):
     """What a posterior over truths says of the reports of a session.
 
