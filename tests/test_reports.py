@@ -439,3 +439,26 @@ def test_bad_input_is_refused_in_its_own_terms():
     only[2, 1] = True
     with pytest.raises(ValueError, match=r"one pair alone .* weigh 0\.5"):
         ObservationProgram(FEATURES, only).solve(only, target, wrong=only)
+
+
+def test_what_is_never_misreported_ends_at_the_limit_and_the_rest_is_still_explained():
+    """A small patrol: forward is taken for right and right for forward, at known places."""
+    n_states, n_actions = 6, 4
+    state, action = np.indices((n_states, n_actions))
+    features = np.stack([action == 0, action == 1, state < 2, action == 2, state])
+    rng = np.random.default_rng(0)
+    truths = rng.dirichlet(np.full(state.size, 0.3))
+    swapped = np.where(action == 0, 2, np.where(action == 2, 0, action))
+    reported = 0.7 * np.eye(state.size) + 0.3 * np.eye(state.size)[(state * n_actions + swapped).ravel()]
+    classes = report_classes(features)
+    members = np.asarray(classes.members)
+    plain = jnp.asarray(members.T @ (truths[:, None] * reported) @ members)
+    statistic = no_reports(classes)._replace(size=jnp.array(100.0), plain=plain)
+    solved = fit(classes, statistic, 0.0, np.ones(5))
+    logits = np.asarray(solved.logits)
+    gap = np.asarray(solved.agreement - statistic.agreement(classes))
+    limited = np.abs(logits) == LIMIT
+    assert limited.any()
+    assert not limited.all()
+    np.testing.assert_allclose(gap[~limited], 0, atol=1e-7)
+    assert (gap[limited] * np.sign(logits[limited]) < 0).all()
