@@ -7,7 +7,12 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 
-from i2rl.inference.noisy_posterior import noisy_log_likelihood, noisy_problem, sample_noisy_posterior
+from i2rl.inference.noisy_posterior import (
+    noisy_log_likelihood,
+    noisy_potential,
+    noisy_problem,
+    sample_noisy_posterior,
+)
 from i2rl.models import (
     Demonstration,
     DemonstrationError,
@@ -61,6 +66,22 @@ def test_the_posterior_is_that_of_quadrature(toy, demonstration):
     np.testing.assert_allclose(
         drawn.log_likelihood.demonstration[0, 5], law.log_prob(jnp.asarray(demonstration.codes)), atol=1e-10
     )
+
+
+def test_labels_take_the_place_of_predicates(toy, demonstration):
+    potential = jax.jit(jax.value_and_grad(noisy_potential))
+    position = jnp.array([1.2, 0.7])
+    plain, named = (
+        potential(position, noisy_problem(toy, psi, demonstration, view=Visibility(VIEW))[0])
+        for psi in (PREDICATES, 7 - 4 * PREDICATES)
+    )
+    np.testing.assert_allclose(named[0], plain[0], rtol=1e-12)
+    np.testing.assert_allclose(named[1], plain[1], rtol=1e-9)
+    state = np.tile(np.arange(3)[:, None], 2)[None]
+    drawn = sample_noisy_posterior(
+        jax.random.key(0), toy, state, demonstration, view=Visibility(VIEW), chains=1, draws=5, warmup=5
+    )
+    assert np.isfinite(drawn.posterior.reliabilities).all()
 
 
 def test_bad_input_is_refused_in_its_own_terms(toy, demonstration):
