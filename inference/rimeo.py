@@ -47,17 +47,17 @@ from .session import Learner
 from .smoothing import Evidence, smooth_all
 from .statistic import blend, complete
 
-Scores = Literal["averaged", "stepwise", "none"]
+Scores = Literal["stepwise", "averaged", "none"]
 Truths = Literal["posterior", "observed", "oracle", "all"]
 
 # Nats in all. Rewards that grow early decide what early reports are taken for.
-DEFAULT_RIDGE = 0.1
+DEFAULT_RIDGE = 0.05
 # Reports in all, per predicate: agreement is learned as if a quarter of a report had been wrong.
 DEFAULT_ERRORS = 0.25
 # Sessions are small: of each, one or two alternations are enough, and more make too much of its guesses.
 DEFAULT_ITERATIONS = 2
 # Exponent by which early guesses are forgotten.
-DEFAULT_MEMORY = 0.75
+DEFAULT_MEMORY = 0.8
 # How often a predicate is thought to be reported rightly before the first session.
 DEFAULT_START = 0.75
 
@@ -122,7 +122,7 @@ def rimeo(
     *,
     view: Imperfection | None = None,
     reportable: ArrayLike | None = None,
-    scores: Scores = "averaged",
+    scores: Scores = "stepwise",
     truths: Truths = "posterior",
     unscored: bool = False,
     solver: str = "newton",
@@ -151,9 +151,10 @@ def rimeo(
         What is hidden (a ``Visibility``); everything is in view by default.
     reportable : bool ``[S, A]``, optional
         Which pairs perception may report; all by default.
-    scores : {"averaged", "stepwise", "none"}
-        Perception's probability of being right enters as the running average of each reported pair
-        (Eq. 6.6), step by step, or not at all.
+    scores : {"stepwise", "averaged", "none"}
+        Perception's probability of being right enters step by step, as the running average of each reported
+        pair (Eq. 6.6), or not at all. An average forgets which report was the doubtful one, so the first is
+        the default.
     truths : {"posterior", "observed", "oracle", "all"}
         What reports are compared with: the posterior over the truth; the report itself; what happened
         (sessions must then be :class:`WithTruth`); every pair alike, as Eq. 6.7 is printed.
@@ -197,7 +198,7 @@ def rimeo(
     method = _checked_method(mdp, view, statistic, slack, ridge)
     psi = _checked_predicates(mdp, predicates, reportable, names)
     for name, value, options in (
-        ("scores", scores, ("averaged", "stepwise", "none")),
+        ("scores", scores, ("stepwise", "averaged", "none")),
         ("truths", truths, ("posterior", "observed", "oracle", "all")),
         ("solver", solver, ("newton", "ipopt")),
     ):
