@@ -59,6 +59,13 @@ class MultiTask(StrEnum):
     all = "all"
 
 
+class NoisyStarts(StrEnum):
+    """Where trajectories of ``run noisy-sorting`` and ``run noisy-patrol`` start."""
+
+    all = "all"
+    natural = "natural"
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of tables.")]
 Instance = Annotated[int, typer.Option(min=1, max=3, help="Patrol instance (1, 2 or 3).")]
 Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same result.")]
@@ -271,6 +278,65 @@ def run_sorting(
         print(json.dumps(sorting_report.summary(study)))
     else:
         sorting_report.print_tables(study, _console())
+        print(f"Report: {report / 'index.html'}")
+
+
+NoisyRuns = Annotated[int, typer.Option(min=1, help="Independent repetitions.")]
+NoisySessions = Annotated[int, typer.Option(min=1, help="Sessions, of two trajectories of three pairs each.")]
+StartsOption = Annotated[
+    NoisyStarts,
+    typer.Option(help="Trajectories start in all states alike, or where the task naturally does."),
+]
+
+
+@run.command("noisy-sorting")
+def run_noisy_sorting(
+    runs: NoisyRuns = 50,
+    sessions: NoisySessions = 20,
+    starts: StartsOption = NoisyStarts.all,
+    belts: Annotated[int, typer.Option(min=1, help="Simulated belts for each method.")] = 1000,
+    seed: Seed = 0,
+    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-noisy-sorting"),
+    as_json: Json = False,
+) -> None:
+    """Learn to sort onions from reports that may be wrong, and how often they are."""
+    _run_noisy("sorting", runs, sessions, starts, seed, report, as_json, belts=belts)
+
+
+@run.command("noisy-patrol")
+def run_noisy_patrol(
+    runs: NoisyRuns = 50,
+    sessions: NoisySessions = 20,
+    starts: StartsOption = NoisyStarts.all,
+    seed: Seed = 0,
+    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-noisy-patrol"),
+    as_json: Json = False,
+) -> None:
+    """Learn a patroller's reward from reports that may be wrong, also where most of it is out of view."""
+    _run_noisy("patrol", runs, sessions, starts, seed, report, as_json)
+
+
+def _run_noisy(
+    task: str,
+    runs: int,
+    sessions: int,
+    starts: NoisyStarts,
+    seed: int,
+    report: Path,
+    as_json: bool,
+    **options: Any,
+) -> None:
+    from . import noisy_report, noisy_study
+
+    with _reported_errors(), _progress(as_json) as advance:
+        study = noisy_study.study(
+            task, runs=runs, sessions=sessions, starts=starts.value, seed=seed, advance=advance, **options
+        )
+        noisy_report.write(study, report)
+    if as_json:
+        print(json.dumps(noisy_report.summary(study)))
+    else:
+        noisy_report.print_tables(study, _console())
         print(f"Report: {report / 'index.html'}")
 
 

@@ -64,8 +64,8 @@ def sensor_posterior(
     learned: Float[np.ndarray, " J"],
     pairs: Float[np.ndarray, "S A"],
     *,
-    draws: int = 150,
-    warmup: int = 150,
+    draws: int = 100,
+    warmup: int = 100,
 ) -> SensorPosterior:
     """Joint posterior over reward and reliabilities, each draw turned into agreement among ``pairs``.
 

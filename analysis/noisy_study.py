@@ -57,6 +57,7 @@ FAIR, CODED = "RIFOM", "RIFOM, as coded"
 KNOWN, CLEAR = "true sensor", "no noise"
 ROBUST, MLIRL = "Robust IRL, batch", "MLIRL, batch"
 HIDDEN, BOTH = "hidden", "hidden and noisy"
+TIMED = (PLAIN, AVERAGED, FAIR)
 STATES = ("all", "choice", "reachable")
 
 # Chances that are not quite zero or one, so that a wrong certainty costs much but not everything.
@@ -73,6 +74,22 @@ def divergence(
         wrong = np.where(p < 1, (1 - p) * np.log((1 - p) / (1 - q)), 0.0)
     mean: np.ndarray = np.maximum(right + wrong, 0.0).mean(-1)
     return mean
+
+
+class MeanInterval(NamedTuple):
+    """A mean over runs and its 95 % interval."""
+
+    mean: Float[np.ndarray, "..."]
+    low: Float[np.ndarray, "..."]
+    high: Float[np.ndarray, "..."]
+
+
+def mean_interval(runs: Float[np.ndarray, "runs ..."]) -> MeanInterval:
+    """Mean over the first axis, with the normal distribution's interval; NaN at its ends for one run."""
+    runs = np.asarray(runs, float)
+    mean, n = runs.mean(0), len(runs)
+    half = 1.96 * runs.std(0, ddof=1) / np.sqrt(n) if n > 1 else np.full_like(mean, np.nan)
+    return MeanInterval(mean, mean - half, mean + half)
 
 
 class Streams(NamedTuple):
@@ -149,19 +166,6 @@ class MethodResult(NamedTuple):
     state: Any = None
 
 
-class Pace(NamedTuple):
-    """Median seconds of a session once compiled, by method."""
-
-    rimeo: float
-    rimeo_scored: float
-    rifom: float
-
-    @property
-    def ratio(self) -> float:
-        """Of the slower RIMEO to RIFOM."""
-        return max(self.rimeo, self.rimeo_scored) / self.rifom
-
-
 class NoisyStudy(NamedTuple):
     """Settings, streams and results.
 
@@ -175,10 +179,11 @@ class NoisyStudy(NamedTuple):
     states : bool ``[3, S]``
         Over which accuracy is averaged, see :data:`STATES`.
     results : mapping from a method's name to MethodResult
-    pace : Pace
+    seconds : mapping from a method's name to float
+        Median of a session once compiled, for :data:`TIMED`.
     hidden : mapping, or None
         Where most of the patrol is out of view: results with noise and without.
-    posterior : SensorPosterior
+    posterior : SensorPosterior or None
         Of the first stream's first :data:`EARLY` sessions.
     strip : Strip
         Another trajectory, as the learner of the first stream understands it in the end.
@@ -195,9 +200,9 @@ class NoisyStudy(NamedTuple):
     true_agreement: Float[np.ndarray, " J"]
     states: Bool[np.ndarray, "3 S"]
     results: Mapping[str, MethodResult]
-    pace: Pace
+    seconds: Mapping[str, float]
     hidden: Mapping[str, MethodResult] | None
-    posterior: SensorPosterior
+    posterior: SensorPosterior | None
     strip: Strip
     belts: SortingTable | None
 
@@ -354,7 +359,7 @@ def study(
     starts: Starts = "all",
     seed: int = 0,
     belts: int = BELTS,
-    draws: int = 150,
+    draws: int = 100,
     methods: Sequence[str] | None = None,
     advance: Advance = lambda description, fraction: None,
 ) -> NoisyStudy:
@@ -372,10 +377,9 @@ def study(
     belts : int
         Simulated belts for each method (sorting).
     draws : int
-        Of each of two chains of the joint posterior.
+        Of each of two chains of the joint posterior; none is sampled for zero.
     methods : sequence of str, optional
-        Some of :data:`METHODS` besides :data:`PLAIN`, :data:`AVERAGED` and :data:`FAIR`, which are always
-        there; all by default.
+        Some of :data:`METHODS` besides :data:`PLAIN`, which is always there; all by default.
 
     Raises
     ------
@@ -384,14 +388,16 @@ def study(
     """
     if name not in TASKS:
         raise ValueError(f"tasks are {', '.join(TASKS)}; got {name!r}")
-    for what, number in (("runs", runs), ("sessions", sessions), ("belts", belts), ("draws", draws)):
+    for what, number in (("runs", runs), ("sessions", sessions), ("belts", belts)):
         if number < 1:
             raise ValueError(f"{what} must be at least 1, got {number}")
+    if draws < 0:
+        raise ValueError(f"draws must not be negative, got {draws}")
     unknown = [method for method in methods or () if method not in METHODS]
     if unknown:
         raise ValueError(f"methods are {'; '.join(METHODS)}; got {unknown[0]!r}")
     task = TASKS[name]()
-    chosen = [m for m in METHODS if methods is None or m in methods or m in (PLAIN, AVERAGED, FAIR)]
+    chosen = [m for m in METHODS if methods is None or m in methods or m == PLAIN]
     draw, learn, hide, show = jax.random.split(jax.random.key(seed), 4)
     streams = draw_streams(draw, task, runs=runs, sessions=sessions, starts=starts)
     pairs = task.pair_distribution(starts, STEPS)
@@ -405,28 +411,25 @@ def study(
         else:
             results[method] = judge.batch(method, learn, streams)
     advance("timing", len(chosen) / (len(chosen) + 3))
-    pace = _pace(task, streams)
+    seconds = {method: _seconds(method, task, streams) for method in TIMED if method in results}
     advance("out of view", (len(chosen) + 1) / (len(chosen) + 3))
     hidden = _hidden(hide, judge, runs, sessions, starts) if name == "patrol" else None
     advance("examples", (len(chosen) + 2) / (len(chosen) + 3))
     posterior, happened, sorted_ = _examples(show, judge, streams, results, starts, pairs, belts, draws)
     advance("done", 1.0)
     return NoisyStudy(
-        task, starts, runs, sessions, seed, streams, judge.true_agreement, judge.states, results, pace,
+        task, starts, runs, sessions, seed, streams, judge.true_agreement, judge.states, results, seconds,
         hidden, posterior, happened, sorted_,
     )  # fmt: skip
 
 
-def _pace(task: NoisyTask, streams: Streams) -> Pace:
+def _seconds(method: str, task: NoisyTask, streams: Streams) -> float:
     """Of the first stream, gone through twice: compiled in one pass, timed in the other."""
-    medians = []
-    for method in (PLAIN, AVERAGED, FAIR):
-        learner = LEARNERS[method].learner(streams.mdp, task)
-        sessions = [streams.session(0, t) for t in range(streams.seen.kind.shape[1])]
-        for _ in range(2):
-            reports = run_sessions(learner, sessions, key=jax.random.key(0)).reports
-        medians.append(float(np.median([report.seconds for report in reports])))
-    return Pace(*medians)
+    learner = LEARNERS[method].learner(streams.mdp, task)
+    sessions = [streams.session(0, t) for t in range(streams.seen.kind.shape[1])]
+    for _ in range(2):
+        reports = run_sessions(learner, sessions, key=jax.random.key(0)).reports
+    return float(np.median([report.seconds for report in reports]))
 
 
 def _hidden(key: Array, judge: _Judge, runs: int, sessions: int, starts: Starts) -> dict[str, MethodResult]:
@@ -456,22 +459,18 @@ def _examples(
     pairs: Float[np.ndarray, "S A"],
     belts: int,
     draws: int,
-) -> tuple[SensorPosterior, Strip, SortingTable | None]:
+) -> tuple[SensorPosterior | None, Strip, SortingTable | None]:
     """Of the first stream: its early sessions' posterior, and a new trajectory as it is understood."""
     learned, early = results[PLAIN], min(EARLY, streams.seen.kind.shape[1])
     assert learned.agreement is not None
     sample, walk, belt = jax.random.split(key, 3)
     seen = streams.whole(0).select(slice(0, early * TRAJECTORIES))
-    posterior = sensor_posterior(
-        sample,
-        judge.task,
-        streams.mdp,
-        seen,
-        learned.agreement[0, early - 1],
-        pairs,
-        draws=draws,
-        warmup=draws,
-    )
+    posterior = None
+    if draws:
+        estimate = learned.agreement[0, early - 1]
+        posterior = sensor_posterior(
+            sample, judge.task, streams.mdp, seen, estimate, pairs, draws=draws, warmup=draws
+        )
     reliabilities = jax.nn.sigmoid(learned.state.logits[0])
     happened = strip(walk, judge.task, learned.weights[0, -1], np.asarray(reliabilities))
     if judge.task.name == TASKS["patrol"]().name:

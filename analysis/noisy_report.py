@@ -1,0 +1,306 @@
+"""The study of noisy perception told: tables, figures, and the report that ``i2rl run noisy-...`` writes."""
+
+from __future__ import annotations
+
+import json
+import math
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from jaxtyping import Float
+
+from . import noisy_figures as figures
+from .noisy_examples import HEADINGS, belt_cells
+from .noisy_study import (
+    AVERAGED,
+    BARE,
+    BOTH,
+    CLEAR,
+    EARLY,
+    FAIR,
+    HIDDEN,
+    HIDDEN_STEPS,
+    OBSERVABILITY,
+    PLAIN,
+    STATES,
+    STEPS,
+    STEPWISE,
+    TRAJECTORIES,
+    NoisyStudy,
+    mean_interval,
+)
+from .report import Picture, Section, Table, write_report
+from .sorting_table import caption, sorting_table_plot, sorting_table_summary
+from .style import save_themes
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+# At most this share of the constant one half's divergence, early and in the end.
+TARGETS = {PLAIN: (1 / 6, 1 / 12), AVERAGED: (1 / 12, 1 / 24), STEPWISE: (1 / 12, 1 / 24)}
+
+
+def summary(study: NoisyStudy) -> dict[str, Any]:
+    """Settings and all measures as plain data."""
+    return {
+        "task": study.task.name,
+        "starts": study.starts,
+        "runs": study.runs,
+        "sessions": study.sessions,
+        "trajectories a session": TRAJECTORIES,
+        "steps": STEPS,
+        "seed": study.seed,
+        "true agreement": dict(zip(study.task.predicate_names, study.true_agreement.tolist(), strict=True)),
+        "divergence of one half": study.control,
+        "methods": [
+            {
+                "method": name,
+                "runs": len(result.weights),
+                "sessions": result.sessions.tolist(),
+                "divergence": _described(result.divergence),
+                "accuracy": {states: _described(result.accuracy[..., i]) for i, states in enumerate(STATES)},
+            }
+            for name, result in study.results.items()
+        ],
+        "hidden": None
+        if study.hidden is None
+        else {name: _described(result.accuracy[..., 0]) for name, result in study.hidden.items()},
+        "seconds a session": dict(study.seconds),
+        "reliabilities": None
+        if study.posterior is None
+        else {
+            "features": list(study.posterior.names),
+            "trajectories": study.posterior.trajectories,
+            "posterior mean": study.posterior.draws.mean(0).tolist(),
+            "learned": study.posterior.learned.tolist(),
+            "truth": study.posterior.truth.tolist(),
+            "divergent transitions": study.posterior.divergences,
+        },
+        "belts": None if study.belts is None else sorting_table_summary(study.belts),
+    }
+
+
+def _described(runs: Float[np.ndarray, "runs T"] | None) -> dict[str, list[float | None]] | None:
+    if runs is None:
+        return None
+    band = mean_interval(runs)
+    return {
+        name: [None if math.isnan(x) else x for x in values.tolist()]
+        for name, values in zip(("mean", "low", "high"), band, strict=True)
+    }
+
+
+# -- tables -------------------------------------------------------------------------------------------
+
+
+def _with_interval(runs: Float[np.ndarray, " runs"], scale: float = 1.0, digits: int = 1) -> str:
+    band = mean_interval(scale * np.asarray(runs))
+    if np.isnan(band.low):
+        return f"{band.mean:.{digits}f}"
+    return f"{band.mean:.{digits}f} ({band.low:.{digits}f}-{band.high:.{digits}f})"
+
+
+def sensor_table(study: NoisyStudy) -> Table:
+    """Divergence of every estimate early and in the end, and as a share of the control."""
+    rows = [("constant one half", f"{study.control:.4f}", "1", "", f"{study.control:.4f}", "1", "")]
+    early, late = min(EARLY, study.sessions), study.sessions
+    for name, result in study.results.items():
+        if result.divergence is None:
+            continue
+        cells: list[str] = [name]
+        for which, session in enumerate((early, late)):
+            values = result.divergence[:, session - 1]
+            share = values.mean() / study.control
+            target = TARGETS[name][which] if name in TARGETS else None
+            met = "" if target is None else f"1/{1 / target:.0f}: {'met' if share <= target else 'missed'}"
+            cells += [_with_interval(values, digits=4), f"{share:.3f}", met]
+        rows.append(tuple(cells))  # type: ignore[arg-type]
+    return Table(
+        (
+            "estimate", f"after {early}", "of one half", "at most",
+            f"after {late}", "of one half", "at most",
+        ),
+        rows,
+        "Kullback-Leibler divergence of the learned agreement probabilities from the true ones in nats, mean "
+        "over predicates, after so many sessions: mean of runs (95 % interval). At most: shares to reach "
+        "after 6 and 20 sessions of all starts.",
+    )  # fmt: skip
+
+
+def behaviour_table(study: NoisyStudy) -> Table:
+    """LBA of every method after the last session."""
+    kept = [0] if study.states.all() else [0, 1, 2]
+    headings = [f"{STATES[i]} states, % ({study.states[i].sum()})" for i in kept]
+    rows = [
+        (name, f"{len(result.weights)}", *(_with_interval(result.accuracy[:, -1, i], 100) for i in kept))
+        for name, result in study.results.items()
+    ]
+    return Table(
+        ("method", "runs", *headings),
+        rows,
+        f"LBA after {study.sessions} sessions: share of states in which the greedy action is one of the "
+        "expert's optimal ones; mean of runs (95 % interval). Choice: more than one action is available; "
+        "reachable: from where the task naturally starts, by any actions.",
+    )
+
+
+def hidden_table(study: NoisyStudy) -> Table:
+    """LBA where most of the patrol is out of view."""
+    assert study.hidden is not None
+    clear, noisy = (study.hidden[name].accuracy[..., 0] for name in (HIDDEN, BOTH))
+    early = min(EARLY, study.sessions)
+    rows = [
+        (name, _with_interval(values[:, early - 1], 100), _with_interval(values[:, -1], 100))
+        for name, values in ((HIDDEN, clear), (BOTH, noisy))
+    ]
+    lost = 100 * (clear - noisy)
+    rows.append(("lost to noise", _with_interval(lost[:, early - 1]), _with_interval(lost[:, -1])))
+    return Table(
+        (f"{OBSERVABILITY} % in view", f"LBA after {early}, %", f"LBA after {study.sessions}, %"),
+        rows,
+        f"Sessions of {TRAJECTORIES} trajectories of {HIDDEN_STEPS} steps, the same paths in both rows. "
+        f"Hidden: reports are exact (LME-I2RL); hidden and noisy: {PLAIN}. Lost: paired over runs.",
+    )
+
+
+def pace_table(study: NoisyStudy) -> Table:
+    """Milliseconds a session, once compiled."""
+    base = study.seconds.get(FAIR, math.nan)
+    rows = [
+        (name, f"{1000 * seconds:.2f}", "-" if math.isnan(base) else f"{seconds / base:.2f}")
+        for name, seconds in study.seconds.items()
+    ]
+    return Table(
+        ("learner", "milliseconds a session", "over RIFOM"),
+        rows,
+        "Median of update once compiled. The dissertation: 96.7 s over 86.0 s to converge, 1.12.",
+    )
+
+
+def belts_table(study: NoisyStudy) -> Table:
+    """Precision and recall beside the table of Figure 7.9."""
+    assert study.belts is not None
+    return Table(
+        HEADINGS,
+        belt_cells(study.belts),
+        caption(study.belts)
+        + " Belts of a method are divided among its runs, and its intervals are over runs. The dissertation "
+        "heads its last two columns the other way round; its percentages fit the order given here.",
+    )
+
+
+def _tables(study: NoisyStudy) -> list[Table]:
+    tables = [sensor_table(study), behaviour_table(study), pace_table(study)]
+    if study.hidden is not None:
+        tables.append(hidden_table(study))
+    if study.belts is not None:
+        tables.append(belts_table(study))
+    return tables
+
+
+def print_tables(study: NoisyStudy, console: Console) -> None:
+    """Print all tables."""
+    from rich.table import Table as RichTable
+
+    console.print(_title(study), highlight=False)
+    for part in _tables(study):
+        table = RichTable(caption=part.caption, caption_justify="left")
+        for i, heading in enumerate(part.headings):
+            table.add_column(heading, justify="left" if i == 0 else "right")
+        for row in part.rows:
+            table.add_row(*map(str, row))
+        console.print(table)
+
+
+# -- the page -----------------------------------------------------------------------------------------
+
+
+def _title(study: NoisyStudy) -> str:
+    name = study.task.name
+    return f"{name[0].upper()}{name[1:]}, starts: {study.starts}"
+
+
+def _text(study: NoisyStudy) -> str:
+    bare = (
+        f"{BARE!r} has nothing but the dissertation's predicates; all pairs that they do not tell apart are "
+        "then reported at random, as far as it knows. The other learners also know parts of a pair that "
+        f"perception might mistake ({', '.join(study.task.label_names)}); that they are clear is learned. "
+        if BARE in study.results
+        else ""
+    )
+    return f"""An expert acts optimally; every pair of its trajectories is reported, some of them wrongly. \
+The learner knows neither how often nor which. {study.runs} independent runs have {study.sessions} sessions \
+of {TRAJECTORIES} trajectories of {STEPS} pairs; reports and calibrated scores are the same for every method.
+
+{bare}The sensor is judged by agreement probabilities: how often a predicate of a report is that of the \
+truth. The reliabilities that parametrise the sensor are no frequencies. Controls: the constant one half; \
+reports compared with what happened (oracle); reports taken for truths (observed, RIFOM); the program as \
+printed (all).
+
+{CLEAR!r} learns from what happened. Methods that know the sensor or need none have the same ridge and \
+number of iterations as RIMEO; those online remember all sessions alike."""
+
+
+def write(study: NoisyStudy, folder: Path | str) -> Path:
+    """Write the report: ``index.html``, the pictures in both themes, and ``results.json``."""
+    folder = Path(folder)
+
+    def picture(name: str, draw: Any, told: str, description: str) -> Picture:
+        return Picture(*save_themes(draw, folder, name), told, description)
+
+    divergence = picture(
+        "divergence", partial(figures.divergence_plot, study),
+        "How far the learned sensor is from the true one (Figures 7.9 and 7.10).",
+        "Divergence of agreement probabilities against sessions, logarithmic, RIMEO and controls",
+    )  # fmt: skip
+    accuracy = picture(
+        "accuracy", partial(figures.accuracy_plot, study),
+        "Learned behaviour accuracy. The axis does not begin at zero.",
+        "Learned behaviour accuracy against sessions for RIMEO, RIFOM and learners that know the sensor",
+    )  # fmt: skip
+    strip = picture(
+        "strip", partial(figures.strip_plot, study.strip, study.task.mdp),
+        f"A new trajectory as {PLAIN} of the first run understands it after its last session. Pairs that "
+        "are never likely are left out.",
+        "Grid of pairs against steps shaded by posterior probability, with what was seen and what happened",
+    )  # fmt: skip
+    sections = [
+        Section(_title(study), _text(study), [sensor_table(study)], [divergence]),
+        Section("Behaviour", "", [behaviour_table(study)], [accuracy]),
+    ]
+    if study.hidden is not None:
+        text = "The view is the patrol study's: a mask of states. What is seen in it may be misreported."
+        sections.append(Section("Out of view, and misreported", text, [hidden_table(study)]))
+    believed = study.strip.believed
+    told = (
+        "No report of this trajectory is wrong."
+        if math.isnan(believed)
+        else f"Where a report is wrong, what happened has posterior probability {believed:.2f} on average."
+    )
+    pictures = [strip]
+    if study.posterior is not None:
+        sensor = picture(
+            "sensor", partial(figures.sensor_plot, study.posterior),
+            "Joint posterior over reward and reliabilities (NUTS), as agreement probabilities, beside "
+            "RIMEO's estimate from the same trajectories.",
+            "Posterior intervals of each feature's agreement probability with the truth marked",
+        )  # fmt: skip
+        pictures.insert(0, sensor)
+    sections.append(Section("What one learner believes", told, [], pictures))
+    if study.belts is not None:
+        belts = picture(
+            "belts",
+            lambda theme: sorting_table_plot(study.belts, theme=theme, title="Sorting after learning"),
+            "What the learned policies do on simulated belts, beside the dissertation's belt (Figure 7.9).",
+            "Precision and recall of the expert and of each method, with intervals",
+        )  # fmt: skip
+        text = (
+            "A policy that errs in a single state on the way may stop sorting altogether, so a method's mean "
+            "over runs is low where some of its runs sort nothing."
+        )
+        sections.append(Section("Sorting", text, [belts_table(study)], [belts]))
+    sections.append(Section("Time", "", [pace_table(study)]))
+    (folder / "results.json").write_text(json.dumps(summary(study), indent=2) + "\n")
+    return write_report(folder, sections, title="Noisy perception")
