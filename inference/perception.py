@@ -164,17 +164,14 @@ def entropic_perception(
 
     def fit_outside(statistic: ReportStatistic, warm: IpoptPoint) -> tuple[Array, IpoptPoint]:
         assert program is not None
-        sizes = np.maximum(np.asarray(classes.members).sum(0), 1.0)
-        plain, wrong = (
-            (np.asarray(table).sum(1) / sizes)[np.asarray(classes.of_pair)]
-            for table in (statistic.plain, statistic.wrong)
-        )
+        of_pair = np.asarray(classes.of_pair)
+        sizes = np.bincount(of_pair.ravel(), minlength=len(classes.reportable))
+        plain, wrong = ((np.asarray(x) / sizes)[of_pair] for x in (statistic.plain, statistic.wrong))
         total = plain.sum() + wrong.sum()
         if total <= 0:  # every report is scored and right: nothing is said of errors
-            return jnp.zeros(classes.agree.shape[-1]), warm
-        matches = np.einsum("co,coj->j", statistic.plain + statistic.wrong, classes.agree)
+            return jnp.zeros(classes.patterns.shape[1]), warm
         solution = program.solve(
-            plain, matches / total, min(float(slack(statistic)) / total, 1.0),
+            plain, np.asarray(statistic.matches) / total, min(float(slack(statistic)) / total, 1.0),
             warm if np.size(warm.variables) else None, wrong=wrong,
         )  # fmt: skip
         return jnp.asarray(solution.logits), solution.warm

@@ -1,7 +1,8 @@
 """What perception reports of a session, as evidence about the truth, and what a posterior says of perception.
 
-Everything is in *classes* of pairs that no predicate tells apart: the table of Eq. 6.5 is ``[C, C]`` instead
-of ``[S, A, S, A]``. A report that leaves the state or the action open is the set of pairs it could be.
+Everything is in *classes* of pairs that no predicate tells apart, and Eq. 6.5 in the patterns of agreement of
+two classes. A report that names a pair costs a number for each class of truths; one that leaves the state or
+the action open is the set of pairs it could be, and costs the whole table ``[C, C]`` of Eq. 6.5.
 
 A score ``c`` is the perception's probability that its report is right. A scored report follows
 ``c [o = g] + (1 - c) O(o | g, o != g)``, where ``O(o | g, o != g)`` is Eq. 6.5 among the *other* pairs: the
@@ -40,41 +41,45 @@ class ReportClasses(NamedTuple):
 
     Fields
     ------
-    agree : float ``[C, C, J]``
-        Whether each predicate of a truth (first) is that of a report (second).
     patterns : float ``[E, J]``
-        Rows of ``agree`` that occur.
+        On which predicates a truth and a report may agree; what does not occur is left out.
     pattern : int ``[C, C]``
-        Which of them.
+        Which of them, by the class of the truth (first) and of the report (second).
     choices : float ``[C, E]``
         Number of pairs that can be reported and agree so with a truth.
     reportable : float ``[C]``
         Number of pairs of each class that perception may report: all of a class, or none.
     of_pair : int ``[S, A]``
-    members : float ``[S*A, C]``
-        One where a pair is in a class.
     can_be_reported : bool ``[S, A]``
     """
 
-    agree: Float[Array, "C C J"]
     patterns: Float[Array, "E J"]
     pattern: Int[Array, "C C"]
     choices: Float[Array, "C E"]
     reportable: Float[Array, " C"]
     of_pair: Int[Array, "S A"]
-    members: Float[Array, "SA C"]
     can_be_reported: Bool[Array, "S A"]
 
     @property
     def wrong_choices(self) -> Float[Array, "C E"]:
         """As ``choices``, of the pairs other than the truth."""
-        return self.choices - (self.reportable > 0)[:, None] * jnp.all(self.patterns == 1, axis=1)
+        return self.choices - (self.reportable > 0)[:, None] * self.itself
+
+    @property
+    def itself(self) -> Bool[Array, " E"]:
+        """The pattern in which every predicate agrees."""
+        return jnp.all(self.patterns == 1, axis=1)
 
     @property
     def certain(self) -> Float[Array, "S A"]:
         """Whether a scored report is right, one or zero, where it could not be otherwise; else NaN."""
         alone = self.can_be_reported & (jnp.sum(self.reportable) == 1)
         return jnp.where(self.can_be_reported, jnp.where(alone, 1.0, jnp.nan), 0.0)
+
+    def gather(self, pairs: Float[Array, "*n S A"]) -> Float[Array, "*n C"]:
+        """Sums over the pairs of each class."""
+        last = jnp.moveaxis(pairs.reshape(*pairs.shape[:-2], -1), -1, 0)
+        return jnp.moveaxis(jax.ops.segment_sum(last, self.of_pair.ravel(), len(self.reportable)), 0, -1)
 
 
 def report_classes(predicates: ArrayLike, reportable: ArrayLike | None = None) -> ReportClasses:
@@ -91,41 +96,13 @@ def report_classes(predicates: ArrayLike, reportable: ArrayLike | None = None) -
     choices = np.zeros((len(vectors), len(patterns)))
     np.add.at(choices, (np.arange(len(vectors))[:, None], pattern), number)
     return ReportClasses(
-        jnp.asarray(agree.astype(float)),
         jnp.asarray(patterns),
         jnp.asarray(pattern),
         jnp.asarray(choices),
         jnp.asarray(number),
         jnp.asarray(of_pair),
-        jax.nn.one_hot(of_pair.ravel(), len(vectors), dtype=float),
         jnp.asarray(mask),
     )
-
-
-class SensorTables(NamedTuple):
-    """Eq. 6.5 normalised, truths first; each entry is of *one* pair of the report's class.
-
-    Fields
-    ------
-    plain : float ``[C, C]``
-        ``O(o | g)``.
-    wrong : float ``[C, C]``
-        ``O(o | g, o != g)``.
-    """
-
-    plain: Float[Array, "C C"]
-    wrong: Float[Array, "C C"]
-
-
-def sensor_tables(classes: ReportClasses, logits: Float[Array, " J"]) -> SensorTables:
-    """The tables of reliabilities ``p_j`` with these logits."""
-    exponents = classes.patterns @ logits
-    terms = jnp.exp(exponents - exponents.max())
-    likelihoods = terms[classes.pattern]
-    total, others = classes.choices @ terms, classes.wrong_choices @ terms
-    possible = others > 0
-    wrong = likelihoods / jnp.where(possible, others, 1.0)[:, None]
-    return SensorTables(likelihoods / total[:, None], jnp.where(possible[:, None], wrong, 0.0))
 
 
 class SessionReports(NamedTuple):
@@ -157,6 +134,11 @@ class SessionReports(NamedTuple):
         """Which reports name one pair."""
         return self.seen & (jnp.sum(self.said, axis=2) == 1)
 
+    @property
+    def open(self) -> Bool[Array, ""]:
+        """Whether any of the reports could be of more than one pair."""
+        return jnp.any(jnp.sum(self.said, axis=2) > 1)
+
 
 def session_reports(
     classes: ReportClasses, demonstration: Demonstration, scored: bool = True
@@ -168,10 +150,77 @@ def session_reports(
     actions = (action[..., None] == UNKNOWN) | (action[..., None] == jnp.arange(n_actions))
     seen = kind == SEEN
     same = states[..., :, None] & actions[..., None, :] & classes.can_be_reported & seen[..., None, None]
-    said = same.reshape(*same.shape[:2], -1).astype(float) @ classes.members
+    said = classes.gather(same.astype(float))
     # Beyond certainty nothing is gained, and nothing could be unlearned.
     score = jnp.where(seen & scored, jnp.clip(score, 0.0, CERTAIN), jnp.nan)
     return SessionReports(kind, said, same, score)
+
+
+# -- Eq. 6.5 ------------------------------------------------------------------------------------------
+
+
+class _Terms(NamedTuple):
+    """Eq. 6.5 up to one factor.
+
+    Fields
+    ------
+    by_pattern : float ``[E]``
+    total, others : float ``[C]``
+        By the class of the truth: sums over all that can be reported, and over all but the truth; one where
+        there is nothing.
+    possible : bool ``[C]``
+        Whether anything but the truth can be reported.
+    itself : float
+        Of the truth itself.
+    """
+
+    by_pattern: Float[Array, " E"]
+    total: Float[Array, " C"]
+    others: Float[Array, " C"]
+    possible: Bool[Array, " C"]
+    itself: Float[Array, ""]
+
+
+def _terms(classes: ReportClasses, logits: Float[Array, " J"]) -> _Terms:
+    """Of reliabilities ``p_j`` with these logits."""
+    exponents = classes.patterns @ logits
+    terms = jnp.exp(exponents - exponents.max())
+    others = classes.wrong_choices @ terms
+    return _Terms(
+        terms,
+        classes.choices @ terms,
+        jnp.where(others > 0, others, 1.0),
+        others > 0,
+        jnp.sum(terms * classes.itself),
+    )
+
+
+def _reported(
+    classes: ReportClasses, reports: SessionReports, by_pattern: Float[Array, " E"]
+) -> Float[Array, "n L C"]:
+    """``sum_o said_o f(agreement of g and o)`` of every step, for truths ``g`` in each class."""
+
+    def named() -> Array:
+        columns = classes.pattern.T[jnp.argmax(reports.said, axis=2)]
+        return jnp.where(reports.whole[..., None], by_pattern[columns], 0.0)
+
+    return lax.cond(reports.open, lambda: reports.said @ by_pattern[classes.pattern].T, named)
+
+
+def _by_pattern(
+    classes: ReportClasses, reports: SessionReports, weights: Float[Array, "n L C"]
+) -> Float[Array, " E"]:
+    """What weights of truths amount to for each pattern: the transpose of :func:`_reported`."""
+    zero = jnp.zeros(len(classes.patterns))
+
+    def named() -> Array:
+        columns = classes.pattern.T[jnp.argmax(reports.said, axis=2)]
+        return zero.at[columns].add(jnp.where(reports.whole[..., None], weights, 0.0))
+
+    def sets() -> Array:
+        return zero.at[classes.pattern].add(jnp.einsum("nlc,nlo->co", weights, reports.said))
+
+    return lax.cond(reports.open, sets, named)
 
 
 class _Likelihood(NamedTuple):
@@ -186,19 +235,16 @@ class _Likelihood(NamedTuple):
 
 
 def _likelihood(
-    classes: ReportClasses,
-    tables: SensorTables,
-    reports: SessionReports,
-    confidence: Float[Array, "... S A"],
+    classes: ReportClasses, terms: _Terms, reports: SessionReports, confidence: Float[Array, "... S A"]
 ) -> _Likelihood:
     """Of every step and truth; ``confidence`` that a report is right given the truth, NaN for none."""
     scored = jnp.broadcast_to(~jnp.isnan(confidence), reports.same.shape)
     c = jnp.where(jnp.isnan(classes.certain), jnp.where(scored, confidence, 0.0), classes.certain)
-    plain = reports.said @ tables.plain.T
-    itself = jnp.diag(tables.wrong)[classes.of_pair]
-    others = (reports.said @ tables.wrong.T)[..., classes.of_pair]
+    reported = _reported(classes, reports, terms.by_pattern)
+    plain = reported / terms.total
+    others = reported[..., classes.of_pair] - reports.same * terms.itself
     right = c * reports.same
-    wrong = (1 - c) * jnp.maximum(others - reports.same * itself, 0.0)
+    wrong = (1 - c) * jnp.maximum(others * (terms.possible / terms.others)[classes.of_pair], 0.0)
     return _Likelihood(
         plain, right, wrong, c, scored, jnp.where(scored, right + wrong, plain[..., classes.of_pair])
     )
@@ -222,7 +268,7 @@ def report_log_evidence(
     presence : float ``[S]``, optional
         Probability of being in view; everything is, by default.
     """
-    total = _likelihood(classes, sensor_tables(classes, logits), reports, confidence).total
+    total = _likelihood(classes, _terms(classes, logits), reports, confidence).total
     reading = jnp.where(total > 0, jnp.log(jnp.where(total > 0, total, 1.0)), -jnp.inf)
     view = jnp.ones(classes.of_pair.shape[0]) if presence is None else presence
     kind = reports.kind[..., None, None]
@@ -240,20 +286,23 @@ class ReportStatistic(NamedTuple):
     ------
     size : float
         Number of reports.
-    plain : float ``[C, C]``
-        Share of unscored reports by class of truth (first) and report, under the posterior of their session.
-    wrong : float ``[C, C]``
+    plain : float ``[C]``
+        Share of unscored reports by class of their truth, under the posterior of their session.
+    wrong : float ``[C]``
         Share of scored reports that are wrong, likewise.
     right : float
         Share of scored reports that are right.
+    matches : float ``[J]``
+        Share of unscored and of wrong reports that agree with their truth on each predicate.
     scores, scored : float ``[S, A]``
         Per report: sum of the scores of each reported pair, and their number (Eq. 6.6 is their ratio).
     """
 
     size: Float[Array, ""]
-    plain: Float[Array, "C C"]
-    wrong: Float[Array, "C C"]
+    plain: Float[Array, " C"]
+    wrong: Float[Array, " C"]
     right: Float[Array, ""]
+    matches: Float[Array, " J"]
     scores: Float[Array, "S A"]
     scored: Float[Array, "S A"]
 
@@ -263,17 +312,17 @@ class ReportStatistic(NamedTuple):
         some = self.scored > 0
         return jnp.where(some, self.scores / jnp.where(some, self.scored, 1.0), jnp.nan)
 
-    def agreement(self, classes: ReportClasses) -> Float[Array, " J"]:
+    @property
+    def agreement(self) -> Float[Array, " J"]:
         """Expected share of reports that agree with their truth on each predicate; NaN before any report."""
-        together = jnp.einsum("co,coj->j", self.plain + self.wrong, classes.agree) + self.right
-        return together / jnp.where(self.size > 0, jnp.sum(self.plain + self.wrong) + self.right, jnp.nan)
+        return _share(self, self.matches)
 
 
 def no_reports(classes: ReportClasses) -> ReportStatistic:
     """The statistic before the first report."""
-    zero, table = jnp.zeros(()), jnp.zeros((len(classes.reportable),) * 2)
-    pairs = jnp.zeros(classes.of_pair.shape)
-    return ReportStatistic(zero, table, table, zero, pairs, pairs)
+    zero, by_class = jnp.zeros(()), jnp.zeros(len(classes.reportable))
+    matches, pairs = jnp.zeros(classes.patterns.shape[1]), jnp.zeros(classes.of_pair.shape)
+    return ReportStatistic(zero, by_class, by_class, zero, matches, pairs, pairs)
 
 
 def score_statistic(reports: SessionReports) -> tuple[Float[Array, "S A"], Float[Array, "S A"]]:
@@ -293,28 +342,27 @@ def report_statistic(
     pairs: Float[Array, "n L S A"],
 ) -> ReportStatistic:
     """What a posterior over truths ``pairs`` says of a session's reports."""
-    tables = sensor_tables(classes, logits)
-    parts = _likelihood(classes, tables, reports, confidence)
+    terms = _terms(classes, logits)
+    parts = _likelihood(classes, terms, reports, confidence)
     mass = pairs * reports.seen[..., None, None]
-    gathered = (jnp.where(parts.scored, 0.0, mass)).reshape(*mass.shape[:2], -1) @ classes.members
-    rate = jnp.where(parts.plain > 0, gathered / jnp.where(parts.plain > 0, parts.plain, 1.0), 0.0)
-    plain = jnp.einsum("nlc,nlo->co", rate, reports.said) * tables.plain
+    plain = jnp.where(parts.plain > 0, classes.gather(jnp.where(parts.scored, 0.0, mass)), 0.0)
     possible = parts.scored & (parts.total > 0)
     share = jnp.where(possible, mass / jnp.where(possible, parts.total, 1.0), 0.0)
-    right = share * parts.right
+    wrong = classes.gather(jnp.sum(share * parts.wrong, axis=(0, 1)))
     # Wrong reports, as if the report could be anything it says, less the truth itself.
-    blame = share * (1 - parts.confidence)
-    by_class = blame.reshape(*mass.shape[:2], -1) @ classes.members
-    itself = (blame * reports.same).sum((0, 1)).reshape(-1) @ classes.members
-    wrong = (jnp.einsum("nlc,nlo->co", by_class, reports.said) - jnp.diag(itself)) * tables.wrong
+    blame = share * (1 - parts.confidence) * (terms.possible / terms.others)[classes.of_pair]
+    rate = plain / jnp.where(parts.plain > 0, parts.plain * terms.total, 1.0)
+    agreed = _by_pattern(classes, reports, rate + classes.gather(blame))
+    agreed = (agreed - classes.itself * jnp.sum(blame * reports.same)) * terms.by_pattern
     size = jnp.sum(reports.seen).astype(float)
     per_report = 1 / jnp.maximum(size, 1.0)
     scores, scored = score_statistic(reports)
     return ReportStatistic(
         size,
-        plain * per_report,
-        jnp.maximum(wrong, 0.0) * per_report,
-        jnp.sum(right) * per_report,
+        plain.sum((0, 1)) * per_report,
+        wrong * per_report,
+        jnp.sum(share * parts.right) * per_report,
+        jnp.maximum(agreed, 0.0) @ classes.patterns * per_report,
         scores * per_report,
         scored * per_report,
     )
@@ -348,13 +396,10 @@ def _moments(
     terms = jnp.exp(exponents - highest)
     value, mean = jnp.zeros(()), jnp.zeros(len(logits))
     curvature = jnp.zeros((len(logits), len(logits)))
-    for table, choices in (
-        (statistic.plain, classes.choices),
-        (statistic.wrong, classes.wrong_choices),
-    ):
+    for truths, choices in ((statistic.plain, classes.choices), (statistic.wrong, classes.wrong_choices)):
         # A truth with nothing to choose from has no weight.
         total = choices @ terms
-        weight, total = jnp.where(total > 0, table.sum(1), 0.0), jnp.where(total > 0, total, 1.0)
+        weight, total = jnp.where(total > 0, truths, 0.0), jnp.where(total > 0, total, 1.0)
         share = choices * terms / total[:, None]
         means = share @ classes.patterns
         value += weight @ (jnp.log(total) + highest)
@@ -430,7 +475,7 @@ def fit_sensor(
     over the pairs other than the truth. ``slack`` is how far the expected agreement may be from the
     statistic's; one error in a hundred reports is a slack of 0.01. Logits stay within ``LIMIT``.
     """
-    matches = jnp.einsum("co,coj->j", statistic.plain + statistic.wrong, classes.agree)
+    matches = statistic.matches
     beta = jnp.broadcast_to(jnp.asarray(slack, float), matches.shape)
 
     def expand(logits: Float[Array, " J"]) -> tuple:
