@@ -124,11 +124,17 @@ def strip(
 ) -> Strip:
     """A fresh trajectory, interpreted with a learned reward and sensor."""
     drawn = demonstrate_noisy(key, task, sessions=1, trajectories=1, steps=steps, starts=starts)
-    plan = soft_plan(drawn.mdp, reward_of(drawn.mdp, jnp.asarray(weights)))
-    evidence = evidence_of(drawn.mdp, FeatureNoise(task.features, np.asarray(reliabilities)), drawn.seen)
-    return Strip(
-        drawn.seen, drawn.truth, np.asarray(smooth_all(drawn.mdp, plan.log_policy, evidence).pairs)[0]
-    )
+    sensor = FeatureNoise(task.features, np.asarray(reliabilities))
+    pairs = _interpreted(drawn.mdp, sensor, jnp.asarray(weights), drawn.seen)
+    return Strip(drawn.seen, drawn.truth, np.asarray(pairs)[0])
+
+
+@jax.jit
+def _interpreted(
+    mdp: TabularMDP, sensor: FeatureNoise, weights: Float[Array, " K"], seen: Demonstration
+) -> Float[Array, "n L S A"]:
+    plan = soft_plan(mdp, reward_of(mdp, weights))
+    return smooth_all(mdp, plan.log_policy, evidence_of(mdp, sensor, seen)).pairs
 
 
 # -- sorting ------------------------------------------------------------------------------------------

@@ -49,13 +49,16 @@ def _draw_mean(
     i: int,
     result: MethodResult,
     runs: Float[np.ndarray, "runs T"],
-    floor: float = 0.0,
+    top: float = np.inf,
 ) -> None:
-    """The ``i``-th method's mean and its band; ``floor`` keeps bands on a logarithmic scale."""
+    """The ``i``-th method's mean and its band, which ends at ``top`` and at a fifth of the mean.
+
+    The normal interval knows nothing of either end of a scale; a logarithmic one has no zero.
+    """
     style, band = series_style(theme, i), mean_interval(runs)
     x = result.sessions
     if len(runs) > 1:
-        low, high = np.maximum(band.low, floor), np.maximum(band.high, floor)
+        low, high = np.maximum(band.low, band.mean / 5), np.minimum(band.high, top)
         axes.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
     axes.plot(
         x, band.mean, label=result.name, linewidth=1.8, markersize=5, markevery=max(len(x) // 7, 1), **style
@@ -94,8 +97,7 @@ def divergence_plot(study: NoisyStudy, theme: Theme) -> Figure:
         for i, name in enumerate(shown):
             result = study.results[name]
             assert result.divergence is not None
-            # Bands that reach below zero end at a hundredth of the control.
-            _draw_mean(panel, theme, i, result, result.divergence, study.control / 100)
+            _draw_mean(panel, theme, i, result, result.divergence)
         panel.axhline(
             study.control, color=theme.ink, linewidth=1.3, linestyle=(0, (1, 1.5)), label="constant one half"
         )
@@ -133,13 +135,13 @@ def accuracy_plot(study: NoisyStudy, theme: Theme) -> Figure:
     for which, (panel, title) in enumerate(zip(panels, titles, strict=False)):
         for i, name in enumerate(names):
             values = study.results[name].accuracy[..., which]
-            _draw_mean(panel, theme, i, study.results[name], values)
+            _draw_mean(panel, theme, i, study.results[name], values, 1.0)
             lowest = min(lowest, float(np.nanmin([mean_interval(values).low, values.mean(0)])))
         for name, marker, shift in ((ROBUST, "*", 0.6), (MLIRL, "X", 1.2)):
             if name in study.results:
                 band = mean_interval(study.results[name].accuracy[:, -1, which])
                 x = study.sessions + shift
-                panel.vlines(x, band.low, band.high, color=theme.ink, linewidth=1.2)
+                panel.vlines(x, band.low, min(float(band.high), 1.0), color=theme.ink, linewidth=1.2)
                 panel.plot(
                     x, band.mean, linestyle="", marker=marker, markersize=8, color=theme.ink, label=name
                 )
@@ -148,7 +150,7 @@ def accuracy_plot(study: NoisyStudy, theme: Theme) -> Figure:
     if study.hidden is not None:
         for i, name in enumerate((HIDDEN, BOTH)):
             values = study.hidden[name].accuracy[..., 0]
-            _draw_mean(panels[-1], theme, 1 - i, study.hidden[name], values)
+            _draw_mean(panels[-1], theme, 1 - i, study.hidden[name], values, 1.0)
             lowest = min(lowest, float(np.nanmin([mean_interval(values).low, values.mean(0)])))
         dress(panels[-1], theme, title=f"{OBSERVABILITY} % in view", x="session")
         # Other lines than those of the first panel, in some of its colours.

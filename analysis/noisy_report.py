@@ -113,7 +113,7 @@ def sensor_table(study: NoisyStudy) -> Table:
         for which, session in enumerate((early, late)):
             values = result.divergence[:, session - 1]
             share = values.mean() / study.control
-            target = TARGETS[name][which] if name in TARGETS else None
+            target = TARGETS[name][which] if name in TARGETS and study.starts == "all" else None
             met = "" if target is None else f"1/{1 / target:.0f}: {'met' if share <= target else 'missed'}"
             cells += [_with_interval(values, digits=4), f"{share:.3f}", met]
         rows.append(tuple(cells))  # type: ignore[arg-type]
@@ -230,6 +230,13 @@ def _text(study: NoisyStudy) -> str:
         if BARE in study.results
         else ""
     )
+    natural = (
+        "\n\nAll trajectories start alike and are short, so reports without scores hardly identify the sensor: "
+        "one that misreports what is done, and an expert who does it, explain the same reports. Scores tell "
+        "them apart. States that are never visited are in LBA over all states nevertheless."
+        if study.starts == "natural"
+        else ""
+    )
     return f"""An expert acts optimally; every pair of its trajectories is reported, some of them wrongly. \
 The learner knows neither how often nor which. {study.runs} independent runs have {study.sessions} sessions \
 of {TRAJECTORIES} trajectories of {STEPS} pairs; reports and calibrated scores are the same for every method.
@@ -240,7 +247,7 @@ reports compared with what happened (oracle); reports taken for truths (observed
 printed (all).
 
 {CLEAR!r} learns from what happened. Methods that know the sensor or need none have the same ridge and \
-number of iterations as RIMEO; those online remember all sessions alike."""
+number of iterations as RIMEO; those online remember all sessions alike.{natural}"""
 
 
 def write(study: NoisyStudy, folder: Path | str) -> Path:
