@@ -37,13 +37,15 @@ PUBLISHED = {
 
 
 class SensorPosterior(NamedTuple):
-    """Agreement probabilities of features: of NUTS, of RIMEO, and true.
+    """Agreement of features: by NUTS, by RIMEO, truly, and as it happened to be.
 
     Fields
     ------
     names : tuple of str ``[J]``
     draws : float ``[draws, J]``
     learned, truth : float ``[J]``
+    happened : float ``[J]``
+        Share of the reports learned from that agree with what they are of.
     trajectories, divergences : int
         That were learned from; divergent transitions of NUTS.
     """
@@ -52,6 +54,7 @@ class SensorPosterior(NamedTuple):
     draws: Float[np.ndarray, "draws J"]
     learned: Float[np.ndarray, " J"]
     truth: Float[np.ndarray, " J"]
+    happened: Float[np.ndarray, " J"]
     trajectories: int
     divergences: int
 
@@ -61,6 +64,7 @@ def sensor_posterior(
     task: NoisyTask,
     mdp: TabularMDP,
     seen: Demonstration,
+    truth: Demonstration,
     learned: Float[np.ndarray, " J"],
     pairs: Float[np.ndarray, "S A"],
     *,
@@ -75,9 +79,11 @@ def sensor_posterior(
     data = sample_noisy_posterior(key, mdp, task.features, seen, draws=draws, warmup=warmup, chains=2)
     reliabilities = np.asarray(data["posterior"]["reliabilities"]).reshape(-1, len(task.features))
     agreement = np.asarray(_agreement(jnp.asarray(task.features), jnp.asarray(pairs), reliabilities))
+    reports, pairs_done = (task.features[:, d.state, d.action] for d in (seen, truth))
     return SensorPosterior(
         task.feature_names, agreement, np.asarray(learned),
-        agreement_probabilities(task.noise, task.features, pairs), seen.n_trajectories,
+        agreement_probabilities(task.noise, task.features, pairs), (reports == pairs_done).mean((1, 2)),
+        seen.n_trajectories,
         int(np.asarray(data["sample_stats"]["diverging"]).sum()),
     )  # fmt: skip
 
@@ -181,7 +187,16 @@ def per_belt(row: SortingRow) -> tuple[float, ...]:
     return tuple(mean * line.sets * line.onions / onions for mean in row.tally.means)
 
 
-HEADINGS = ("method", "belts", "TP, FP, TN, FN", "precision, %", "recall, %", "LBA, choice states, %")
+def _sorting_runs(table: SortingTable, row: SortingRow) -> str:
+    """How many runs have at least half the expert's recall."""
+    if row.method == EXPERT:
+        return ""
+    enough = table.rows[0].tally.recall().value / 2
+    blemished = row.tally.true_positives + row.tally.false_negatives
+    return f"{(row.tally.true_positives >= enough * blemished).sum()} of {len(blemished)}"
+
+
+HEADINGS = ("method", "belts", "TP, FP, TN, FN", "precision, %", "recall, %", "runs that sort", "LBA, %")
 
 
 def belt_cells(table: SortingTable) -> list[tuple[str, ...]]:
@@ -200,10 +215,12 @@ def belt_cells(table: SortingTable) -> list[tuple[str, ...]]:
     for row in table.rows:
         means = ", ".join(f"{mean:.1f}" for mean in per_belt(row))
         accuracy = f"{100 * row.choice_accuracy:.0f}"
-        lines.append((row.method, "simulated", means, *measures(row.tally, 1), accuracy))
+        lines.append(
+            (row.method, "simulated", means, *measures(row.tally, 1), _sorting_runs(table, row), accuracy)
+        )
         if row.published is not None:
             counts = ", ".join(map(str, row.published))
-            lines.append(("", "dissertation", counts, *measures(row.published, 0), ""))
+            lines.append(("", "dissertation", counts, *measures(row.published, 0), "", ""))
     counts = ", ".join(map(str, PUBLISHED["AIRL"]))
-    lines.append(("AIRL", "dissertation", counts, *measures(PUBLISHED["AIRL"], 0), ""))
+    lines.append(("AIRL", "dissertation", counts, *measures(PUBLISHED["AIRL"], 0), "", ""))
     return lines

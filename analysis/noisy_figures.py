@@ -171,7 +171,7 @@ def accuracy_plot(study: NoisyStudy, theme: Theme) -> Figure:
 
 
 def sensor_plot(posterior: SensorPosterior, theme: Theme) -> Figure:
-    """Posterior of each agreement probability (median, middle 90 %), RIMEO's estimate, and the truth."""
+    """Each agreement probability: its posterior (median, middle 90 %), RIMEO's estimate, and the truth."""
     band = quantile_band(posterior.draws, 0.9)
     n = len(posterior.names)
     figure = new_figure(theme, 7.4, 1.9 + 0.36 * n)
@@ -187,10 +187,15 @@ def sensor_plot(posterior: SensorPosterior, theme: Theme) -> Figure:
         posterior.learned, y, linestyle="", marker="|", markersize=13, markeredgewidth=2.4,
         color=theme.series[2], clip_on=False,
     )  # fmt: skip
+    axes.plot(
+        posterior.happened, y + 0.26, linestyle="", marker="x", markersize=6, markeredgewidth=1.6,
+        color=theme.ink, clip_on=False,
+    )  # fmt: skip
     dress(axes, theme, x="probability that a report agrees with the truth", grid="x")
     axes.set_yticks(y, list(posterior.names), fontsize=TEXT)
     axes.set_ylim(n - 0.4, -0.6)
-    axes.set_xlim(max(min(band.low.min(), posterior.truth.min(), posterior.learned.min()) - 0.05, 0.0), 1.0)
+    least = np.min([band.low, posterior.truth, posterior.learned, posterior.happened])
+    axes.set_xlim(max(least - 0.03, 0.0), 1.0)
     handles: list[Artist] = [
         Line2D([], [], color=theme.series[0], marker="o", linewidth=3, markersize=6,
                label="posterior: median, middle 90%"),
@@ -198,8 +203,10 @@ def sensor_plot(posterior: SensorPosterior, theme: Theme) -> Figure:
                label=PLAIN),
         Line2D([], [], color=theme.series[1], marker="D", linestyle="", markersize=8, markerfacecolor="none",
                markeredgewidth=1.7, label="truth"),
+        Line2D([], [], color=theme.ink, marker="x", linestyle="", markersize=6, markeredgewidth=1.6,
+               label="share of these reports"),
     ]  # fmt: skip
-    head(figure, theme, handles, title="How reliable each feature is thought to be")
+    head(figure, theme, handles, title="How reliable each feature is thought to be", columns=2)
     foot(figure, theme, f"learned from {posterior.trajectories} trajectories without scores")
     return figure
 

@@ -76,6 +76,7 @@ def summary(study: NoisyStudy) -> dict[str, Any]:
             "posterior mean": study.posterior.draws.mean(0).tolist(),
             "learned": study.posterior.learned.tolist(),
             "truth": study.posterior.truth.tolist(),
+            "in these reports": study.posterior.happened.tolist(),
             "divergent transitions": study.posterior.divergences,
         },
         "belts": None if study.belts is None else sorting_table_summary(study.belts),
@@ -186,8 +187,9 @@ def belts_table(study: NoisyStudy) -> Table:
         HEADINGS,
         belt_cells(study.belts),
         caption(study.belts)
-        + " Belts of a method are divided among its runs, and its intervals are over runs. The dissertation "
-        "heads its last two columns the other way round; its percentages fit the order given here.",
+        + " Belts of a method are divided among its runs, and its intervals are over runs. Runs that sort "
+        "have at least half the expert's recall. The dissertation heads its last two columns the other way "
+        "round; its percentages fit the order given here.",
     )
 
 
@@ -231,9 +233,9 @@ def _text(study: NoisyStudy) -> str:
         else ""
     )
     natural = (
-        "\n\nAll trajectories start alike and are short, so reports without scores hardly identify the sensor: "
-        "one that misreports what is done, and an expert who does it, explain the same reports. Scores tell "
-        "them apart. States that are never visited are in LBA over all states nevertheless."
+        "\n\nAll trajectories start alike and are short, so reports without scores hardly identify the "
+        "sensor: an odd report may be wrong, or the expert may be odd. Scores tell the two apart. "
+        "LBA over all states counts those that are never visited, too."
         if study.starts == "natural"
         else ""
     )
@@ -304,8 +306,8 @@ def write(study: NoisyStudy, folder: Path | str) -> Path:
             "Precision and recall of the expert and of each method, with intervals",
         )  # fmt: skip
         text = (
-            "A policy that errs in a single state on the way may stop sorting altogether, so a method's mean "
-            "over runs is low where some of its runs sort nothing."
+            "A policy that errs in a single state on the way may stop sorting altogether: runs sort about as "
+            "the expert does, or hardly at all, and a mean over them is like neither."
         )
         sections.append(Section("Sorting", text, [belts_table(study)], [belts]))
     sections.append(Section("Time", "", [pace_table(study)]))

@@ -464,16 +464,17 @@ def _examples(
     learned, early = results[PLAIN], min(EARLY, streams.seen.kind.shape[1])
     assert learned.agreement is not None
     sample, walk, belt = jax.random.split(key, 3)
-    seen = streams.whole(0).select(slice(0, early * TRAJECTORIES))
+    first = slice(0, early * TRAJECTORIES)
+    seen, truth = (streams.whole(0, of).select(first) for of in ("seen", "truth"))
     posterior = None
     if draws:
         estimate = learned.agreement[0, early - 1]
         posterior = sensor_posterior(
-            sample, judge.task, streams.mdp, seen, estimate, pairs, draws=draws, warmup=draws
+            sample, judge.task, streams.mdp, seen, truth, estimate, pairs, draws=draws, warmup=draws
         )
     reliabilities = jax.nn.sigmoid(learned.state.logits[0])
     happened = strip(walk, judge.task, learned.weights[0, -1], np.asarray(reliabilities))
     if judge.task.name == TASKS["patrol"]().name:
         return posterior, happened, None
-    sorters = {m: results[m].weights[:, -1] for m in (AVERAGED, PLAIN, FAIR, MLIRL) if m in results}
+    sorters = {m: results[m].weights[:, -1] for m in (AVERAGED, STEPWISE, PLAIN, FAIR, MLIRL) if m in results}
     return posterior, happened, sorted_belts(belt, judge.task, sorters, belts=belts)

@@ -167,12 +167,15 @@ def test_report_has_every_method_and_both_themes(tmp_path):
 def test_sensor_plot_has_each_feature_and_the_truth_where_it_is():
     truth = np.array([0.7, 0.95])
     draws = np.random.default_rng(2).beta(20, 5, size=(50, 2))
-    posterior = SensorPosterior(("forward", "state"), draws, draws.mean(0), truth, 12, 0)
+    posterior = SensorPosterior(
+        ("forward", "state"), draws, draws.mean(0), truth, np.array([0.8, 1.0]), 12, 0
+    )
     axes = noisy_figures.sensor_plot(posterior, LIGHT).axes[0]
     assert [label.get_text() for label in axes.get_yticklabels()] == ["forward", "state"]
-    median, marked, learned = (line.get_xdata() for line in axes.get_lines())
+    median, marked, learned, happened = (line.get_xdata() for line in axes.get_lines())
     np.testing.assert_allclose(marked, truth)
     np.testing.assert_allclose(learned, draws.mean(0))
+    np.testing.assert_allclose(happened, [0.8, 1.0])
     low, high = axes.get_xlim()
     assert low < min(truth.min(), median.min())
     assert high == 1
