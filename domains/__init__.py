@@ -7,6 +7,14 @@ from .breach_environment import BreachEnv
 from .breach_trials import BreachOutcome, breach_trials, greedy_policies, random_policies, soft_policies
 from .environments import TabularEnv
 from .labyrinth import Bout, Labyrinth, labyrinth, read_bouts, simulate_bouts
+from .noisy_perception import (
+    NoisyDemonstration,
+    NoisyTask,
+    agreement_probabilities,
+    demonstrate_noisy,
+    noisy_patrol,
+    noisy_sorting,
+)
 from .object_world import ObjectWorld, object_world, walled_world, without_blocked_moves
 from .patrol import (
     Interaction,
@@ -27,6 +35,7 @@ from .sorting import (
     sorting_without_claiming,
 )
 from .sorting_line import Line, Tally, sort_belts
+from .swap_noise import SwapNoise
 
 __all__ = [
     "Bout",
@@ -36,20 +45,27 @@ __all__ = [
     "Labyrinth",
     "Line",
     "MixedDemonstration",
+    "NoisyDemonstration",
+    "NoisyTask",
     "ObjectWorld",
     "Patrol",
     "Sorting",
+    "SwapNoise",
     "TabularEnv",
     "Tally",
+    "agreement_probabilities",
     "boyd_fifth_floor",
     "boyd_with_rooms",
     "breach_trials",
     "demonstrate",
+    "demonstrate_noisy",
     "demonstrate_sorting",
     "four_hallways",
     "greedy_policies",
     "instance",
     "labyrinth",
+    "noisy_patrol",
+    "noisy_sorting",
     "object_world",
     "pick_inspect_place",
     "random_policies",

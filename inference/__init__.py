@@ -51,6 +51,15 @@ _HOMES = {
         "clustering_of",
         "mme_mtirl",
     ),
+    "noisy_posterior": ("sample_noisy_posterior",),
+    "observation_program": (
+        "Identification",
+        "ObservationProgram",
+        "ObservationSolution",
+        "unidentified_predicates",
+    ),
+    "observation_printed": ("solve_printed_program",),
+    "perception": ("WithTruth",),
     "policy_walk": ("birl",),
     "minmax": ("MinMaxProgram", "MinMaxSolution"),
     "minmax_printed": (
@@ -63,7 +72,9 @@ _HOMES = {
     "mixture_posterior": ("sample_mixture_posterior",),
     "mixture_problem": ("label_invariant",),
     "posterior": ("sample_posterior",),
+    "rimeo": ("RIMEOReport", "RIMEOState", "rifom", "rimeo", "robust_irl"),
     "schedule": ("Harmonic",),
+    "sensor_identification": ("SensorIdentification", "sensor_identification"),
     "session": (
         "Fleet",
         "Learner",
