@@ -30,6 +30,9 @@ from ..version import __version__
 from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
 from .posterior import _described, _fingerprint, gather
 
+# Nats: a mode that holds less than e^-this of the best one is no place to start a chain.
+_NEGLIGIBLE = float(np.log(100.0))
+
 
 class NoisyProblem(NamedTuple):
     """Arguments of :func:`noisy_behaviour_model`, identical trajectories gathered."""
@@ -109,18 +112,55 @@ def noisy_chain(
 _run_chain = jax.jit(noisy_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
 
 
-def noisy_mode(problem: NoisyProblem) -> Mode:
-    """A mode of the unconstrained density, from no weights and reliabilities a little above one half.
+def noisy_mode(problem: NoisyProblem, origin: Float[np.ndarray, " D"] | None = None) -> Mode:
+    """A mode of the unconstrained density, climbed to from ``origin``.
 
-    Only a place to start from: where sloppy experts and sloppy sensors explain the same, there are others.
+    By default that is no weights and reliabilities a little above one half. Only a place to start from: where
+    sloppy experts and sloppy sensors explain the same, there are others.
     """
-
-    sizes = [
-        dist.biject_to(prior.support).inverse_shape(prior.event_shape)[0]
-        for prior in (problem.prior, problem.reliability_prior)
-    ]
-    origin = np.concatenate([np.zeros(sizes[0]), np.full(sizes[1], 1.0)])
+    if origin is None:
+        sizes = [
+            dist.biject_to(prior.support).inverse_shape(prior.event_shape)[0]
+            for prior in (problem.prior, problem.reliability_prior)
+        ]
+        origin = np.concatenate([np.zeros(sizes[0]), np.full(sizes[1], 1.0)])
     return mode_of(lambda x: _potential_and_gradient(x, problem), origin)
+
+
+def noisy_starts(key: Array, problem: NoisyProblem, chains: int) -> list[Mode]:
+    """Where chains start, with the covariance that each starts from; the same key gives the same.
+
+    The first climbs from the default origin of :func:`noisy_mode`, the others from draws of the prior, so
+    that modes far apart are found if there are any. One that by its height and curvature holds less than a
+    hundredth of what the best does gives way to that one: no chain could leave it, and draws of all chains
+    count alike. Starts are dispersed around their modes twice as widely as the curvature suggests.
+    """
+    spread_key, *keys = jax.random.split(key, chains)
+    modes = [noisy_mode(problem)]
+    modes += [noisy_mode(problem, _drawn_from_prior(k, problem)) for k in keys]
+    held = [
+        np.linalg.slogdet(mode.covariance)[1] / 2 - float(_potential_and_gradient(mode.position, problem)[0])
+        for mode in modes
+    ]
+    best = int(np.argmax(held))
+    modes = [
+        mode if mass > held[best] - _NEGLIGIBLE else modes[best]
+        for mode, mass in zip(modes, held, strict=True)
+    ]
+    away = np.asarray(jax.random.normal(spread_key, (chains, len(modes[0].position))))
+    return [
+        Mode(mode.position + 2.0 * np.linalg.cholesky(mode.covariance) @ x, mode.covariance)
+        for mode, x in zip(modes, away, strict=True)
+    ]
+
+
+def _drawn_from_prior(key: Array, problem: NoisyProblem) -> Float[np.ndarray, " D"]:
+    priors = problem.prior, problem.reliability_prior
+    drawn = [
+        dist.biject_to(prior.support).inv(prior.sample(k))
+        for k, prior in zip(jax.random.split(key), priors, strict=True)
+    ]
+    return np.concatenate(drawn)
 
 
 @jax.jit
@@ -190,8 +230,11 @@ def sample_noisy_posterior(
 ) -> az.InferenceData:
     """Draw from the joint posterior over weights and reliabilities of :func:`noisy_behaviour_model`.
 
-    Chains start around a mode, dispersed twice as widely as its curvature suggests, and run in as many
-    threads as there are processors. The same key gives the same draws.
+    Chains start around modes that are climbed to from different origins (:func:`noisy_starts`) and run in as
+    many threads as there are processors. The same key gives the same draws. Chains that stay in modes of
+    their own show in R-hat; their draws then say what modes there are, not how much each of them holds. A
+    prior that does not favour perception better than chance leaves a mirrored mode, see
+    :func:`~i2rl.models.noisy_behaviour.reliabilities_prior`.
 
     Parameters
     ----------
@@ -232,17 +275,13 @@ def sample_noisy_posterior(
     names = tuple(f"psi{j + 1}" for j in range(n_predicates)) if names is None else names
     if len(names) != n_predicates:
         raise ValueError(f"there is one name for each of {n_predicates} predicates, got {list(names)}")
-    mode = noisy_mode(problem)
     start_key, chain_key = jax.random.split(key)
-    spread = 2.0 * np.linalg.cholesky(mode.covariance)
-    starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
+    starts = noisy_starts(start_key, problem, chains)
     run = partial(
         _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
     )
     keys = jax.random.split(chain_key, chains)
-    chain: NoisyChain = in_threads(
-        run, [(k, problem, x, mode.covariance) for k, x in zip(keys, starts, strict=True)]
-    )
+    chain: NoisyChain = in_threads(run, [(k, problem, *start) for k, start in zip(keys, starts, strict=True)])
     flat = (jnp.asarray(x.reshape(chains * draws, -1)) for x in (chain.weights, chain.reliabilities))
     log_likelihood = np.asarray(noisy_log_likelihood(*flat, problem))[:, rows].reshape(chains, draws, -1)
     steps = ["trajectory", "step"]

@@ -106,13 +106,15 @@ def test_reliabilities_of_nearly_one_leave_the_law_of_exact_perception(toy, impe
     weights = jnp.array([1.0, 2.0])
     log_policy = soft_plan(toy, reward_of(toy, weights)).log_policy
     codes = jnp.asarray(imperfect_demonstration(5, toy, log_policy, Visibility(VIEW), 10, 4).codes)
-    sites = {"weights": weights, "reliabilities": jnp.full(3, 1 - 1e-13)}
+    p = np.full(3, 1 - 1e-13)
+    sites = {"weights": weights, "reliabilities": jnp.asarray(p)}
     density, _ = log_density(
         noisy_behaviour_model, (toy, jnp.asarray(numbers), codes), {"view": Visibility(VIEW)}, sites
     )
     exact = TrajectoryLaw(toy, weights, Visibility(VIEW), 4).log_prob(codes).sum()
     assert np.isfinite(exact)
-    assert abs(float(density) - float(exact) - stats.norm.logpdf(weights, scale=2.5).sum()) < 1e-9
+    prior = stats.norm.logpdf(weights, scale=2.5).sum() + stats.beta.logpdf(p, 4, 1).sum()
+    assert abs(float(density) - float(exact) - prior) < 1e-9
 
 
 def test_without_codes_the_model_simulates(toy, predicates):

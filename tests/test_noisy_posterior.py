@@ -1,5 +1,7 @@
 """The joint posterior over weights and reliabilities: against quadrature, and at its borders."""
 
+from dataclasses import replace
+
 import arviz as az
 import jax
 import jax.numpy as jnp
@@ -9,8 +11,10 @@ import pytest
 
 from i2rl.inference.noisy_posterior import (
     noisy_log_likelihood,
+    noisy_mode,
     noisy_potential,
     noisy_problem,
+    noisy_starts,
     sample_noisy_posterior,
 )
 from i2rl.models import (
@@ -21,7 +25,7 @@ from i2rl.models import (
     Visibility,
     sample_demonstration,
 )
-from i2rl.models.demonstration import SEEN
+from i2rl.models.demonstration import SEEN, UNKNOWN
 
 PREDICATES = np.array([[[1, 0], [1, 1], [0, 1]]], bool)
 VIEW = np.array([1.0, 0.4, 0.8])
@@ -103,3 +107,24 @@ def test_bad_input_is_refused_in_its_own_terms(toy, demonstration):
     told = Demonstration.from_codes(np.array([[[SEEN, 0, 0], [SEEN, 1, 1]]], np.int32))
     with pytest.raises(DemonstrationError, match="trajectory 0, step 1: impossible observation"):
         sample(told, reportable=mute)
+
+
+def test_chains_start_in_both_modes_where_both_hold_something(toy):
+    # One predicate and its own negative as the only feature: reports wrong, weights turned, is as likely.
+    action = np.tile(np.arange(2), (3, 1))
+    mdp = replace(toy, features=jnp.asarray(action[..., None] - 0.5))
+    told = np.concatenate([np.zeros((90, 1), int), np.ones((10, 1), int)])
+    reports = Demonstration.from_pairs(np.full((100, 1), UNKNOWN), told)
+    even, _ = noisy_problem(mdp, action[None], reports, reliability_prior=dist.Beta(1.0, 1.0))
+    starts = noisy_starts(jax.random.key(0), even, 8)
+    modes = np.array([noisy_mode(even, start.position).position for start in starts])
+    assert {*np.sign(modes[:, 1])} == {-1.0, 1.0}
+    np.testing.assert_allclose(np.abs(modes), np.broadcast_to(np.abs(modes[0]), modes.shape), rtol=1e-3)
+    assert (np.sign(modes[:, 0]) == -np.sign(modes[:, 1])).all()
+    # The same key gives the same starts; perception better than chance leaves one mode.
+    for one, again in zip(starts, noisy_starts(jax.random.key(0), even, 8), strict=True):
+        np.testing.assert_array_equal(one.position, again.position)
+    better, _ = noisy_problem(mdp, action[None], reports)
+    starts = noisy_starts(jax.random.key(0), better, 8)
+    modes = np.array([noisy_mode(better, start.position).position for start in starts])
+    assert (modes[:, 1] > 0).all()

@@ -7,9 +7,9 @@ runs, and the truth's rank among the draws is uniform (Cook, Gelman and Rubin 20
 model, simulation and sampler agree. That holds on average over the prior, whether or not the data tell
 sloppy experts from sloppy sensors: it says nothing of what is identified, nor of any one truth.
 
-Reliabilities come from Beta(4, 1), perception being more often right than wrong. With ``--uniform`` ones a
-predicate reported wrongly, and weights of the other sign, explain almost as well: a second mode, which
-chains that start around one mode seldom find, and coverage falls short.
+Reliabilities come from the model's default, Beta(4, 1), perception being more often right than wrong. With
+``--uniform`` ones a predicate reported wrongly, and weights of the other sign, explain almost as well: a
+second mode, which chains seldom reach from the first.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from rich.progress import track
 from scipy import stats
 
 from ...domains.noisy_perception import SORTING_PREDICATES, noisy_sorting
-from ...inference.noisy_posterior import NoisyProblem, noisy_chain, noisy_mode, noisy_problem
+from ...inference.noisy_posterior import NoisyProblem, noisy_chain, noisy_problem, noisy_starts
 from ...models import Demonstration, FeatureNoise, TabularMDP, TrajectoryLaw
 from .calibration import Ranks, uniformity
 from .harness import print_table, publish
@@ -125,8 +125,7 @@ class CoverageStudy(NamedTuple):
 def corridor(reliability_prior: dist.Distribution | None = None) -> NoisySetting:
     """Four cells, two headings and three actions: go on, turn round, wait; one in ten fails.
 
-    Ten trajectories of five steps; three weights, ``Normal(0, 1.5)``, and three predicates. Reliabilities
-    are uniform by default.
+    Ten trajectories of five steps; three weights, ``Normal(0, 1.5)``, and three predicates.
     """
     cells, slip = 4, 0.1
     cell, heading = (x.ravel() for x in np.meshgrid(np.arange(cells), (0, 1), indexing="ij"))
@@ -173,9 +172,8 @@ def replicate(
 ) -> Iterator[Run]:
     """Draw truths from the prior, simulate, and sample each posterior; the same key gives the same runs.
 
-    Chains start as those of ``sample_noisy_posterior``: around a mode, dispersed twice as widely as its
-    curvature suggests. All runs share one compiled sampler and keep every processor busy. Raises
-    ``ValueError`` for fewer than one run.
+    Chains start as those of ``sample_noisy_posterior``. All runs share one compiled sampler and keep every
+    processor busy. Raises ``ValueError`` for fewer than one run.
     """
     if runs < 1:
         raise ValueError(f"runs must be at least 1, got {runs}")
@@ -208,11 +206,9 @@ def _replication(key: Array, template: NoisyProblem, setting: NoisySetting, samp
     reliabilities = template.reliability_prior.sample(of_reliabilities)
     codes = _simulated(look_key, template, weights, reliabilities)
     problem = template._replace(codes=codes)
-    mode = noisy_mode(problem)
-    away = np.asarray(jax.random.normal(start_key, (sampling.chains, len(mode.position))))
-    starts = mode.position + 2.0 * away @ np.linalg.cholesky(mode.covariance).T
+    starts = noisy_starts(start_key, problem, sampling.chains)
     chains = [
-        _sampled(k, problem, start, mode.covariance, warmup=sampling.warmup, draws=sampling.draws)
+        _sampled(k, problem, *start, warmup=sampling.warmup, draws=sampling.draws)
         for k, start in zip(jax.random.split(chain_key, sampling.chains), starts, strict=True)
     ]
     drawn = np.array([c.weights for c in chains]), np.array([c.reliabilities for c in chains])
@@ -359,12 +355,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--runs", type=int, default=400)
     parser.add_argument("--task", choices=tuple(SETTINGS), default="corridor")
-    parser.add_argument("--uniform", action="store_true", help="uniform reliabilities, not Beta(4, 1)")
+    parser.add_argument(
+        "--uniform", action="store_true", help="reliabilities from Beta(1, 1), not the model's default"
+    )
     parser.add_argument("--warmup", type=int, default=Sampling().warmup)
     parser.add_argument("--draws", type=int, default=Sampling().draws)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    setting = SETTINGS[options.task](None if options.uniform else dist.Beta(4.0, 1.0))
+    setting = SETTINGS[options.task](dist.Beta(1.0, 1.0) if options.uniform else None)
     sampling = Sampling(warmup=options.warmup, draws=options.draws)
     began = time.perf_counter()
     runs = replicate(jax.random.key(options.seed), setting, options.runs, sampling)
