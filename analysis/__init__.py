@@ -93,7 +93,7 @@ _HOMES = {
         "rimeo_no_regret_sizes",
         "same_reports_constraint_bound",
     ),
-    "perception_coverage": ("learned_perception_coverage", "perception_coverage", "posterior_change"),
+    "noise_coverage": ("learned_perception_coverage", "perception_coverage", "posterior_change"),
     "perception_distance": (
         "ModelDistance",
         "Perception",

@@ -29,7 +29,7 @@ from ..domains.patrol import instance
 from ..inference.lme import lme_i2rl
 from ..inference.maximum_likelihood import mlirl
 from ..inference.perception import WithTruth
-from ..inference.rimeo import DEFAULT_ITERATIONS, DEFAULT_RIDGE, rifom, rimeo, robust_irl
+from ..inference.robust import DEFAULT_ITERATIONS, DEFAULT_RIDGE, rifom, rimeo, robust_irl
 from ..inference.session import Learner, run_sessions, run_streams
 from ..models.demonstration import SEEN, Demonstration
 from ..models.evidence import Imperfection, Sensor, Visibility

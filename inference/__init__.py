@@ -17,6 +17,7 @@ _HOMES = {
     "darko": ("darko_i2rl", "ending_at", "feature_margin", "goal_sessions", "stopping_places", "with_end"),
     "dpm": ("DPMBIRL", "DPMTrace", "dpm_birl"),
     "entropic": ("entropic_proportions",),
+    "identification": ("SensorIdentification", "sensor_identification"),
     "jin": ("jin_i2rl", "jin_i2rl_with_features", "reward_correction", "with_state_features"),
     "journal": ("Journal", "JournalBusy", "JournalError", "JournalView", "Position", "SessionRecord"),
     "lme": (
@@ -72,9 +73,8 @@ _HOMES = {
     "mixture_posterior": ("sample_mixture_posterior",),
     "mixture_problem": ("label_invariant",),
     "posterior": ("sample_posterior",),
-    "rimeo": ("RIMEOReport", "RIMEOState", "rifom", "rimeo", "robust_irl"),
+    "robust": ("RIMEOReport", "RIMEOState", "rifom", "rimeo", "robust_irl"),
     "schedule": ("Harmonic",),
-    "sensor_identification": ("SensorIdentification", "sensor_identification"),
     "session": (
         "Fleet",
         "Learner",

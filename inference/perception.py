@@ -1,7 +1,7 @@
 """Ways of learning what perception is worth: from a posterior over truths, or by counting (section 6.1).
 
 Each says how a session's reports are summarised, how summaries are merged, and which reliabilities follow;
-:mod:`.rimeo` does the rest alike for all.
+:mod:`.robust` does the rest alike for all.
 """
 
 from __future__ import annotations

@@ -249,7 +249,7 @@ def rifom(
     """RIFOM (section 7.3): RIMEO with reliabilities by counting, every report taken for the truth.
 
     ``form`` is ``"fair"`` (all steps, weighted by scores where there are any, Laplace-smoothed) or
-    ``"coded"`` (as in the released program, see :func:`~i2rl.inference.perception.coded_perception`;
+    ``"coded"`` (as in the released program, see ``coded_perception``;
     predicates must then be true or false). Other parameters and errors as of :func:`rimeo`.
     """
     method = _checked_method(mdp, view, statistic, slack, ridge)

@@ -14,7 +14,7 @@ from i2rl.analysis.coverage import (
     simulate_codes,
 )
 from i2rl.analysis.perception_bounds import rimeo_confidence
-from i2rl.analysis.perception_coverage import (
+from i2rl.analysis.noise_coverage import (
     complete_under,
     counted_reliabilities,
     learned_perception_coverage,

@@ -91,7 +91,7 @@ def sensor_identification(
     Parameters
     ----------
     mdp, predicates, view, reportable, scores, errors
-        As of :func:`~i2rl.inference.rimeo.rimeo`.
+        As of :func:`~i2rl.inference.rimeo`.
     demonstration : Demonstration
         To judge by, the more the better; needs no truth.
     weights : float ``[K]``

@@ -10,8 +10,8 @@ import pytest
 
 from i2rl.domains import noisy_perception
 from i2rl.inference import run_sessions
-from i2rl.inference.rimeo import rimeo
-from i2rl.inference.sensor_identification import sensor_identification
+from i2rl.inference.identification import sensor_identification
+from i2rl.inference.robust import rimeo
 from i2rl.models.demonstration import concatenate
 
 KEY = jax.random.key(2)

@@ -15,7 +15,7 @@ from i2rl.inference import Journal, MovingWindow, fleet, run_sessions
 from i2rl.inference.lme import lme_i2rl
 from i2rl.inference.perception import WithTruth
 from i2rl.inference.reports import CERTAIN
-from i2rl.inference.rimeo import rifom, rimeo, robust_irl
+from i2rl.inference.robust import rifom, rimeo, robust_irl
 from i2rl.models import Demonstration, DemonstrationError, FeatureNoise, TrajectoryLaw, Visibility
 from i2rl.models.demonstration import HIDDEN, PAD, SEEN, concatenate
 from i2rl.models.evidence import Sensor
