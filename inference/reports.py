@@ -44,7 +44,7 @@ class ReportClasses(NamedTuple):
     patterns : float ``[E, J]``
         On which predicates a truth and a report may agree; what does not occur is left out.
     pattern : int ``[C, C]``
-        Which of them, by the class of the truth (first) and of the report (second).
+        Which of them two classes have; symmetric.
     choices : float ``[C, E]``
         Number of pairs that can be reported and agree so with a truth.
     reportable : float ``[C]``
@@ -201,10 +201,10 @@ def _reported(
     """``sum_o said_o f(agreement of g and o)`` of every step, for truths ``g`` in each class."""
 
     def named() -> Array:
-        columns = classes.pattern.T[jnp.argmax(reports.said, axis=2)]
-        return jnp.where(reports.whole[..., None], by_pattern[columns], 0.0)
+        at = classes.pattern[jnp.argmax(reports.said, axis=2)]
+        return jnp.where(reports.whole[..., None], by_pattern[at], 0.0)
 
-    return lax.cond(reports.open, lambda: reports.said @ by_pattern[classes.pattern].T, named)
+    return lax.cond(reports.open, lambda: reports.said @ by_pattern[classes.pattern], named)
 
 
 def _by_pattern(
@@ -214,8 +214,8 @@ def _by_pattern(
     zero = jnp.zeros(len(classes.patterns))
 
     def named() -> Array:
-        columns = classes.pattern.T[jnp.argmax(reports.said, axis=2)]
-        return zero.at[columns].add(jnp.where(reports.whole[..., None], weights, 0.0))
+        at = classes.pattern[jnp.argmax(reports.said, axis=2)]
+        return zero.at[at].add(jnp.where(reports.whole[..., None], weights, 0.0))
 
     def sets() -> Array:
         return zero.at[classes.pattern].add(jnp.einsum("nlc,nlo->co", weights, reports.said))
