@@ -68,6 +68,7 @@ def summary(study: NoisyStudy) -> dict[str, Any]:
         if study.hidden is None
         else {name: _described(result.accuracy[..., 0]) for name, result in study.hidden.items()},
         "seconds a session": dict(study.seconds),
+        "identified": {method: doubt.known for method, doubt in study.doubt.items()},
         "reliabilities": None
         if study.posterior is None
         else {
@@ -106,9 +107,13 @@ def _with_interval(runs: Float[np.ndarray, " runs"], scale: float = 1.0, digits:
 def sensor_table(study: NoisyStudy) -> Table:
     """Divergence of every estimate early and in the end, and as a share of the control."""
     rows = [("constant one half", f"{study.control:.4f}", "1", "", f"{study.control:.4f}", "1", "")]
+    unknown = not _identified(study, PLAIN)
     early, late = min(EARLY, study.sessions), study.sessions
     for name, result in study.results.items():
         if result.divergence is None:
+            continue
+        if unknown and name in (PLAIN, BARE):
+            rows.append((name, *("not identified", "", "") * 2))
             continue
         cells: list[str] = [name]
         for which, session in enumerate((early, late)):
@@ -128,6 +133,35 @@ def sensor_table(study: NoisyStudy) -> Table:
         "over predicates, after so many sessions: mean of runs (95 % interval). At most: shares to reach "
         "after 6 and 20 sessions of all starts.",
     )  # fmt: skip
+
+
+def _identified(study: NoisyStudy, method: str) -> bool:
+    """Whether the sensor is known in at least half of the runs; what was not asked is not doubted."""
+    return method not in study.doubt or study.doubt[method].known >= 0.5
+
+
+def doubt_table(study: NoisyStudy) -> Table:
+    """Whose errors they are: agreement under what may be assumed of the expert."""
+    rows: list[tuple[str, ...]] = []
+    for method, doubt in study.doubt.items():
+        for j, name in enumerate(study.task.predicate_names):
+            rows.append(
+                (
+                    method if j == 0 else "",
+                    name,
+                    _with_interval(doubt.erratic[:, j], digits=2),
+                    _with_interval(doubt.decided[:, j], digits=2),
+                    f"{study.true_agreement[j]:.2f}",
+                    f"{doubt.identified[:, j].sum()} of {len(doubt.identified)}",
+                )
+            )
+    return Table(
+        ("learner", "predicate", "if the expert errs", "if he is decided", "truth", "runs identified"),
+        rows,
+        "Agreement of reports with the truth, fitted to all reports of a run under the reward it learned, "
+        "for an expert as erratic as was learned and for one who always does what is best; mean of runs "
+        "(95 % interval). Where the two are more than 0.05 apart, reports do not say whose the errors are.",
+    )
 
 
 def behaviour_table(study: NoisyStudy) -> Table:
@@ -194,7 +228,7 @@ def belts_table(study: NoisyStudy) -> Table:
 
 
 def _tables(study: NoisyStudy) -> list[Table]:
-    tables = [sensor_table(study), behaviour_table(study), pace_table(study)]
+    tables = [sensor_table(study), doubt_table(study), behaviour_table(study), pace_table(study)]
     if study.hidden is not None:
         tables.append(hidden_table(study))
     if study.belts is not None:
@@ -252,6 +286,15 @@ printed (all).
 number of iterations as RIMEO; those online remember all sessions alike.{natural}"""
 
 
+def _doubts(study: NoisyStudy) -> str:
+    lines = [
+        f"{method}: the sensor is {'' if _identified(study, method) else 'not '}identified "
+        f"(in {doubt.known:.0%} of runs all predicates are)."
+        for method, doubt in study.doubt.items()
+    ]
+    return " ".join(lines)
+
+
 def write(study: NoisyStudy, folder: Path | str) -> Path:
     """Write the report: ``index.html``, the pictures in both themes, and ``results.json``."""
     folder = Path(folder)
@@ -277,6 +320,7 @@ def write(study: NoisyStudy, folder: Path | str) -> Path:
     )  # fmt: skip
     sections = [
         Section(_title(study), _text(study), [sensor_table(study)], [divergence]),
+        Section("The expert's errors, or the sensor's?", _doubts(study), [doubt_table(study)]),
         Section("Behaviour", "", [behaviour_table(study)], [accuracy]),
     ]
     if study.hidden is not None:

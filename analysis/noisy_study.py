@@ -26,6 +26,7 @@ from ..domains.noisy_perception import (
     noisy_sorting,
 )
 from ..domains.patrol import instance
+from ..inference.identification import sensor_identifier
 from ..inference.lme import lme_i2rl
 from ..inference.maximum_likelihood import mlirl
 from ..inference.perception import WithTruth
@@ -58,6 +59,8 @@ KNOWN, CLEAR = "true sensor", "no noise"
 ROBUST, MLIRL = "Robust IRL, batch", "MLIRL, batch"
 HIDDEN, BOTH = "hidden", "hidden and noisy"
 TIMED = (PLAIN, AVERAGED, STEPWISE, FAIR)
+# Learners whose sensor is asked whether the expert's errors could be its own, and their scores.
+DOUBTED = {PLAIN: "none", STEPWISE: "stepwise"}
 STATES = ("all", "choice", "reachable")
 
 # Chances that are not quite zero or one, so that a wrong certainty costs much but not everything.
@@ -166,6 +169,26 @@ class MethodResult(NamedTuple):
     state: Any = None
 
 
+class SensorDoubt(NamedTuple):
+    """Whether the learned sensors are known, by run: see :mod:`i2rl.inference.identification`.
+
+    Fields
+    ------
+    erratic, decided : float ``[runs, J]``
+        Agreement of the task's predicates, by what is assumed of the expert.
+    identified : bool ``[runs, J]``
+    """
+
+    erratic: Float[np.ndarray, "runs J"]
+    decided: Float[np.ndarray, "runs J"]
+    identified: Bool[np.ndarray, "runs J"]
+
+    @property
+    def known(self) -> float:
+        """Share of runs in which all predicates are identified."""
+        return float(self.identified.all(1).mean())
+
+
 class NoisyStudy(NamedTuple):
     """Settings, streams and results.
 
@@ -181,6 +204,8 @@ class NoisyStudy(NamedTuple):
     results : mapping from a method's name to MethodResult
     seconds : mapping from a method's name to float
         Median of a session once compiled, for :data:`TIMED`.
+    doubt : mapping from a method's name to SensorDoubt
+        For :data:`DOUBTED`, on the first :data:`FEW` streams.
     hidden : mapping, or None
         Where most of the patrol is out of view: results with noise and without.
     posterior : SensorPosterior or None
@@ -201,6 +226,7 @@ class NoisyStudy(NamedTuple):
     states: Bool[np.ndarray, "3 S"]
     results: Mapping[str, MethodResult]
     seconds: Mapping[str, float]
+    doubt: Mapping[str, SensorDoubt]
     hidden: Mapping[str, MethodResult] | None
     posterior: SensorPosterior | None
     strip: Strip
@@ -348,6 +374,19 @@ def taken_at_face_value(mdp: TabularMDP, reports: Demonstration) -> tuple[Tabula
     return anywhere, Demonstration.from_pairs(states[offered, None], actions[offered, None])
 
 
+def _doubted(task: NoisyTask, streams: Streams, result: MethodResult, scores: str) -> SensorDoubt:
+    identify = sensor_identifier(streams.mdp, task.features, scores=scores)
+    found = [
+        identify(streams.whole(run), result.weights[run, -1]) for run in range(min(len(result.weights), FEW))
+    ]
+    n_predicates = len(task.predicates)
+    erratic, decided, identified = (
+        np.array([getattr(x, name)[:n_predicates] for x in found])
+        for name in ("erratic", "decided", "identified")
+    )
+    return SensorDoubt(erratic, decided, identified)
+
+
 # -- the study ----------------------------------------------------------------------------------------
 
 
@@ -412,6 +451,7 @@ def study(
             results[method] = judge.batch(method, learn, streams)
     advance("timing", len(chosen) / (len(chosen) + 3))
     seconds = _seconds([method for method in TIMED if method in results], task, streams)
+    doubt = {m: _doubted(task, streams, results[m], scores) for m, scores in DOUBTED.items() if m in results}
     advance("out of view", (len(chosen) + 1) / (len(chosen) + 3))
     hidden = _hidden(hide, judge, runs, sessions, starts) if name == "patrol" else None
     advance("examples", (len(chosen) + 2) / (len(chosen) + 3))
@@ -419,7 +459,7 @@ def study(
     advance("done", 1.0)
     return NoisyStudy(
         task, starts, runs, sessions, seed, streams, judge.true_agreement, judge.states, results, seconds,
-        hidden, posterior, happened, sorted_,
+        doubt, hidden, posterior, happened, sorted_,
     )  # fmt: skip
 
 

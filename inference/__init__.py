@@ -17,7 +17,7 @@ _HOMES = {
     "darko": ("darko_i2rl", "ending_at", "feature_margin", "goal_sessions", "stopping_places", "with_end"),
     "dpm": ("DPMBIRL", "DPMTrace", "dpm_birl"),
     "entropic": ("entropic_proportions",),
-    "identification": ("SensorIdentification", "sensor_identification"),
+    "identification": ("SensorIdentification", "sensor_identification", "sensor_identifier"),
     "jin": ("jin_i2rl", "jin_i2rl_with_features", "reward_correction", "with_state_features"),
     "journal": ("Journal", "JournalBusy", "JournalError", "JournalView", "Position", "SessionRecord"),
     "lme": (

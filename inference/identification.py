@@ -11,7 +11,7 @@ lie between them.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -79,47 +79,67 @@ def sensor_identification(
     predicates: ArrayLike,
     demonstration: Demonstration,
     weights: ArrayLike,
-    *,
-    view: Imperfection | None = None,
-    reportable: ArrayLike | None = None,
-    scores: str = "stepwise",
-    errors: float = 0.25,
-    tolerance: float = 0.05,
+    **options: Any,
 ) -> SensorIdentification:
     """Fit the sensor under the learned reward, to an erratic and to a decided expert.
 
     Parameters
     ----------
-    mdp, predicates, view, reportable, scores, errors
+    mdp, predicates
         As of :func:`~i2rl.inference.rimeo`.
     demonstration : Demonstration
         To judge by, the more the better; needs no truth.
     weights : float ``[K]``
         The reward that was learned.
-    tolerance : float
-        By how much agreement may differ and still be called identified.
+    **options
+        Of :func:`sensor_identifier`, which is the better choice for many demonstrations.
 
     Raises
     ------
     ValueError
         For weights or predicates of the wrong shape.
     """
-    w = np.asarray(weights, float)
-    if w.shape != (mdp.n_features,):
-        raise ValueError(f"weights have shape [K] = [{mdp.n_features}], got {list(w.shape)}")
+    return sensor_identifier(mdp, predicates, **options)(demonstration, weights)
+
+
+def sensor_identifier(
+    mdp: TabularMDP,
+    predicates: ArrayLike,
+    *,
+    view: Imperfection | None = None,
+    reportable: ArrayLike | None = None,
+    scores: str = "stepwise",
+    errors: float = 0.25,
+    tolerance: float = 0.05,
+) -> Callable[[Demonstration, ArrayLike], SensorIdentification]:
+    """:func:`sensor_identification` of many demonstrations, compiled once for each of their shapes.
+
+    ``view``, ``reportable``, ``scores`` and ``errors`` are those of :func:`~i2rl.inference.rimeo`; agreement
+    may differ by ``tolerance`` and still be called identified.
+    """
     psi = np.asarray(predicates)
     classes = report_classes(psi, reportable)
     perception = entropic_perception(classes, scores, "posterior", errors, 1.0)
-    session = prepare(mdp, classes, demonstration.bucketed(), perception.scored)
-    reward = reward_of(mdp, jnp.asarray(w))
-    best = deterministic_policy(hard_plan(mdp, reward).optimal)
-    slips = mdp.available / mdp.available.sum(1, keepdims=True)
-    decided = jnp.log((1 - _ERRS) * best + _ERRS * slips)
     fit = _fit(mdp, perception, (Sensor() if view is None else Sensor() * view).presence)
-    erratic, sure = (fit(session, policy) for policy in (soft_plan(mdp, reward).log_policy, decided))
-    visits = np.asarray(jnp.exp(decided)) * np.asarray(mdp.available)
-    structure = unidentified_predicates(psi, visits, reportable)
-    return SensorIdentification(np.asarray(erratic), np.asarray(sure), structure, tolerance)
+    slips = mdp.available / mdp.available.sum(1, keepdims=True)
+
+    def identify(demonstration: Demonstration, weights: ArrayLike) -> SensorIdentification:
+        w = np.asarray(weights, float)
+        if w.shape != (mdp.n_features,):
+            raise ValueError(f"weights have shape [K] = [{mdp.n_features}], got {list(w.shape)}")
+        session = prepare(mdp, classes, demonstration.bucketed(), perception.scored)
+        reward = reward_of(mdp, jnp.asarray(w))
+        best = deterministic_policy(hard_plan(mdp, reward).optimal)
+        decided = (1 - _ERRS) * best + _ERRS * slips
+        erratic, sure = (
+            np.asarray(fit(session, policy))
+            for policy in (soft_plan(mdp, reward).log_policy, jnp.log(decided))
+        )
+        # Wherever this expert may be: what differs nowhere cannot be told.
+        structure = unidentified_predicates(psi, np.asarray(decided), reportable)
+        return SensorIdentification(erratic, sure, structure, tolerance)
+
+    return identify
 
 
 def _fit(

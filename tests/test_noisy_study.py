@@ -210,3 +210,13 @@ def test_command_writes_its_page(tmp_path, monkeypatch):
     assert "Noisy perception" in (tmp_path / "index.html").read_text()
     wrong = CliRunner().invoke(app, ["run", "noisy-patrol", "--starts", "somewhere"])
     assert wrong.exit_code != 0
+
+
+def test_where_the_experts_errors_could_be_the_sensors_no_number_is_quoted():
+    natural = noisy_study.study(
+        "sorting", runs=2, sessions=20, starts="natural", belts=1, draws=0, methods=()
+    )
+    assert natural.doubt[noisy_study.PLAIN].known < 0.5
+    row = next(r for r in noisy_report.sensor_table(natural).rows if r[0] == noisy_study.PLAIN)
+    assert row[1] == "not identified"
+    assert not any(character.isdigit() for cell in row[1:] for character in str(cell))

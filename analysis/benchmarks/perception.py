@@ -20,8 +20,8 @@ from ...domains.noisy_perception import feature_noise, noisy_sorting
 from ...models.evidence import FeatureNoise
 from ...models.mdp import TabularMDP
 from ..coverage import Coverage, Setting, coverage_table, ignorance_gap
-from ..perception_bounds import perception_needed
 from ..noise_coverage import learned_perception_coverage, perception_coverage, posterior_change
+from ..perception_bounds import perception_needed
 from .harness import print_table, publish
 
 _DELTA = 0.1 / 3
