@@ -461,6 +461,8 @@ def _residual(gradient: Array, slack: Array, logits: Array) -> Array:
     return jnp.max(jnp.abs(jnp.clip(step, -LIMIT, LIMIT) - logits))
 
 
+# Compiled by itself, too: a session whose reward program is solved outside JAX calls it from there.
+@jax.jit
 def fit_sensor(
     classes: ReportClasses,
     statistic: ReportStatistic,
