@@ -55,7 +55,6 @@ from .harness import median_seconds, print_table, publish, seconds
 
 REPORTED = "RIMEO, stepwise"
 COUNTED = "RIFOM"
-IPOPT = "RIMEO, stepwise, by IPOPT"
 # Of a report, that it is of any pair whatever.
 ASTRAY = 0.1
 WARM = 3
@@ -167,8 +166,8 @@ def measured_growth(sizes: Sequence[int], make: Callable[[int], Stream]) -> dict
     return {name: growth(sizes, x) for name, x in medians.items()}
 
 
-def session_seconds(task: NoisyTask, sessions: int, by_ipopt: int = 3) -> dict[str, dict[str, float]]:
-    """Seconds of a session by learner, and how many times RIFOM's; ``by_ipopt`` sessions by IPOPT."""
+def session_seconds(task: NoisyTask, sessions: int) -> dict[str, dict[str, float]]:
+    """Seconds of a session by learner, and how many times RIFOM's."""
     stream = stream_of(task, sessions + WARM)
     mdp, psi = stream.mdp, stream.predicates
     spent = interleaved_seconds(
@@ -177,17 +176,13 @@ def session_seconds(task: NoisyTask, sessions: int, by_ipopt: int = 3) -> dict[s
             "RIMEO, no scores": rimeo(mdp, psi, scores="none"),
             "RIMEO, averaged": rimeo(mdp, psi, scores="averaged"),
             REPORTED: rimeo(mdp, psi),
+            "RIMEO, stepwise, by IPOPT": rimeo(mdp, psi, solver="ipopt"),
         },
         stream,
     )
-    few = stream._replace(seen=stream.seen.select(slice(0, stream.trajectories * (by_ipopt + WARM))))
-    outside = interleaved_seconds({COUNTED: rifom(mdp, psi), IPOPT: rimeo(mdp, psi, solver="ipopt")}, few)
-    against = {name: (x, spent[COUNTED]) for name, x in spent.items()} | {
-        IPOPT: (outside[IPOPT], outside[COUNTED])
-    }
     found = {}
-    for name, (x, counted) in against.items():
-        ratio, low, high = ratio_of_medians(x, counted)
+    for name, x in spent.items():
+        ratio, low, high = ratio_of_medians(x, spent[COUNTED])
         found[name] = {
             "median": float(np.median(x)), "nine in ten below": float(np.quantile(x, 0.9)),
             "times RIFOM": ratio, "from": low, "to": high,
@@ -274,14 +269,11 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0] if __doc__ else None)
     parser.add_argument("--sessions", type=int, default=100, help="of each task")
     parser.add_argument("--points", type=int, default=20, help="sessions timed at each size")
-    parser.add_argument("--by-ipopt", type=int, default=3, help="sessions of each task solved by IPOPT")
     parser.add_argument("--out", type=Path, default=None)
     options = parser.parse_args()
     tasks = {task.name: task for task in (noisy_sorting(), noisy_patrol())}
     results: dict[str, Any] = {
-        "session": {
-            name: session_seconds(task, options.sessions, options.by_ipopt) for name, task in tasks.items()
-        },
+        "session": {name: session_seconds(task, options.sessions) for name, task in tasks.items()},
         "parts": {name: part_seconds(task) for name, task in tasks.items()},
         "patterns": pattern_seconds(),
     }
