@@ -160,7 +160,9 @@ def entropic_perception(
         return errors / jnp.maximum(statistic.size, 1.0)
 
     def fit(statistic: ReportStatistic, logits: Array) -> Array:
-        return fit_sensor(classes, statistic, slack(statistic), logits).logits
+        fitted = fit_sensor(classes, statistic, slack(statistic), logits).logits
+        # Where nothing was reported yet, slack alone would turn what was assumed into ignorance.
+        return jnp.where(statistic.size > 0, fitted, logits)
 
     def fit_outside(statistic: ReportStatistic, warm: IpoptPoint) -> tuple[Array, IpoptPoint]:
         assert program is not None

@@ -23,7 +23,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from ..models.demonstration import SEEN, Demonstration, DemonstrationError
-from ..models.evidence import FeatureNoise, Imperfection, Sensor, require_possible
+from ..models.evidence import FeatureNoise, Imperfection, Sensor, require_fitting, require_possible
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted
 from .lme import Batch, _change, _digest, _Method, _method, _newton, _random_weights, batch_lme
@@ -206,8 +206,6 @@ def rimeo(
             raise ValueError(f"{name} must be one of {', '.join(options)}, got {value!r}")
     if not 0 <= errors < np.inf:
         raise ValueError(f"errors must be a number of reports, not negative, got {errors}")
-    if not 0 < memory <= 1:
-        raise ValueError(f"memory is an exponent in (0, 1], got {memory}")
     classes = report_classes(psi, reportable)
     if truths == "all":
         if scores == "none":
@@ -292,6 +290,7 @@ def _checked_method(
     seen = Sensor() if view is None else Sensor() * view
     if seen.reading is not None:
         raise ValueError("the view says what is hidden; how reports err is learned, not given")
+    require_fitting(seen, mdp)
     return _method(mdp, seen, statistic, "exact", slack, ridge, 0)
 
 
@@ -322,7 +321,12 @@ def _half_sure(psi: np.ndarray, reportable: ArrayLike | None) -> FeatureNoise:
 
 def _first_logits(psi: np.ndarray, start: ArrayLike) -> Float[Array, " J"]:
     """Logits that are right this often where every value of a predicate is equally common."""
-    p = np.broadcast_to(np.asarray(start, float), (len(psi),))
+    p = np.asarray(start, float)
+    if p.shape not in ((), (len(psi),)):
+        raise ValueError(
+            f"start is one number, or one for each of {len(psi)} predicates, got {list(p.shape)}"
+        )
+    p = np.broadcast_to(p, (len(psi),))
     if not ((p > 0) & (p < 1)).all():
         raise ValueError(f"start is how often predicates are right, between 0 and 1, got {start}")
     others = np.array([max(len(np.unique(values)) - 1, 1) for values in psi])
@@ -399,7 +403,8 @@ class _Alternation(NamedTuple):
     def advance(self, point: _Point, expected: _Expected, logits: Array, solution: Any) -> _Point:
         """The point after both M-steps."""
         agreement = self.perception.agreement(logits, expected.reports)
-        moved = jnp.max(jnp.abs(agreement - point.agreement))
+        # Before the first report there is no agreement that could move.
+        moved = jnp.max(jnp.where(jnp.isnan(agreement), 0.0, jnp.abs(agreement - point.agreement)))
         weights = jnp.asarray(solution.weights)
         return _Point(
             weights, jnp.asarray(solution.values), logits, agreement,
@@ -454,6 +459,8 @@ def _learner(
 ) -> Learner:
     if iterations < 1:
         raise ValueError(f"a session needs at least one iteration, got {iterations}")
+    if not 0 < memory <= 1:
+        raise ValueError(f"memory is an exponent in (0, 1], got {memory}")
     mdp = method.mdp
     parts = _Alternation(method, perception, memory)
 
@@ -489,6 +496,8 @@ def _learner(
     def update(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOReport]:
         began = time.perf_counter()
         seen = _checked_session(name, demonstration, scores_needed, "oracle" in name)
+        if isinstance(demonstration, WithTruth):
+            _require_truth(mdp, demonstration)
         require_slack_in(method.slack, int(state.session) + 1)
         heard = state
         if perception.hear is not None:
@@ -542,7 +551,7 @@ def _outside(
             slack, ridge = method.penalties(expected.working, state.session + 1)
             solution, rewards = solve(expected.working, slack, ridge, rewards)
             logits = perception.fit(expected.reports, point.logits)
-            if perception.fit_outside is not None:
+            if perception.fit_outside is not None and expected.reports.size > 0:
                 logits, sensor = perception.fit_outside(expected.reports, sensor)
             reward = WarmStart(jnp.asarray(solution.weights), jnp.asarray(solution.values))
             point = advance(point, expected, logits, _Solved(*reward, jnp.asarray(solution.iterations)))
@@ -581,3 +590,22 @@ def _checked_session(name: str, demonstration: Any, scores_needed: bool, truth_n
             "allow reports without one (unscored=True)"
         )
     return seen
+
+
+def _require_truth(mdp: TabularMDP, demonstration: WithTruth) -> None:
+    """Raise :class:`DemonstrationError` unless what happened is known wherever something was reported."""
+    seen, truth = demonstration
+    if np.shape(truth.kind) != np.shape(seen.kind):
+        raise DemonstrationError(
+            f"what happened and what was seen are arrays of one shape, got {list(np.shape(truth.kind))} and "
+            f"{list(np.shape(seen.kind))}"
+        )
+    states, actions = np.asarray(truth.state), np.asarray(truth.action)
+    known = (states >= 0) & (states < mdp.n_states) & (actions >= 0) & (actions < mdp.n_actions)
+    missing = (np.asarray(seen.kind) == SEEN) & ~known
+    if missing.any():
+        i, t = np.argwhere(missing)[0]
+        raise DemonstrationError(
+            f"trajectory {i}, step {t}: what happened must be a pair of the MDP, "
+            f"got state {states[i, t]}, action {actions[i, t]}"
+        )

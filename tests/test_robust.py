@@ -34,6 +34,12 @@ def learned_with(scores):
 
 
 @cache
+def learned_half_hidden(solver):
+    mdp, view = stream()[0], Visibility(np.full(22, 0.5))
+    return rimeo(mdp, task().features, view=view, scores="none", solver=solver), view
+
+
+@cache
 def stream(scores="calibrated", sessions=6):
     shown = noisy_perception.demonstrate_noisy(
         jax.random.key(5), task(), sessions=sessions, scores=scores, starts="all"
@@ -114,7 +120,7 @@ def test_a_score_of_nearly_one_makes_reports_the_truth():
 
 def test_what_is_hidden_as_well_is_summed_out():
     mdp, seen, _ = stream()
-    view = Visibility(np.full(mdp.n_states, 0.5))
+    learner, view = learned_half_hidden("newton")
     hidden = np.random.default_rng(0).random((2, 3)) < 0.5
     hidden[0, 0] = False
     partly = [
@@ -124,7 +130,6 @@ def test_what_is_hidden_as_well_is_summed_out():
         )
         for x in seen
     ]  # fmt: skip
-    learner = rimeo(mdp, task().features, view=view, scores="none")
     state, report = learner.update(learner.init(KEY), partly[0])
     noise = FeatureNoise(task().features, np.asarray(jax.nn.sigmoid(state.logits)))
     law = TrajectoryLaw(mdp, state.weights, noise * view, 3)
@@ -132,6 +137,22 @@ def test_what_is_hidden_as_well_is_summed_out():
         report.demonstration_log_likelihood, np.sum(law.log_prob(jnp.asarray(partly[0].codes))), rtol=1e-9
     )
     assert float(state.reports.size) == (~hidden).sum()
+
+
+@pytest.mark.parametrize("solver", ["newton", "ipopt"])
+def test_sessions_without_a_report_do_not_unlearn_what_was_assumed(solver):
+    _mdp, seen, _ = stream()
+    learner, _ = learned_half_hidden(solver)
+    nothing = Demonstration(
+        np.full((2, 3), HIDDEN, np.int8), *np.full((2, 2, 3), -1, np.int32), np.full((2, 3), np.nan)
+    )
+    start = learner.init(KEY)
+    state, report = learner.update(start, nothing)
+    assert np.isnan(report.agreement).all()
+    np.testing.assert_array_equal(state.logits, start.logits)
+    late = learner.update(state, seen[0])[1].agreement
+    # Chance agrees on these predicates far less often than perception that is thought to be right.
+    np.testing.assert_allclose(late, learner.update(start, seen[0])[1].agreement, atol=0.02)
 
 
 # -- the session protocol -----------------------------------------------------------------------------
@@ -185,6 +206,12 @@ def test_a_fleet_learns_what_its_learners_learn():
     for i, key in enumerate(jax.random.split(KEY, 2)):
         alone = learner.update(learner.init(key), seen[i])[1]
         np.testing.assert_allclose(reports.agreement[i], alone.agreement, atol=1e-8)
+    # A fleet raises nothing; what cannot be leaves its learner as it was.
+    left, reports = many.update(states, both._replace(state=both.state + np.array([99, 0])[:, None, None]))
+    np.testing.assert_array_equal(np.isneginf(reports.demonstration_log_likelihood), [True, False])
+    for field in ("weights", "logits", "session"):
+        np.testing.assert_array_equal(getattr(left, field)[0], getattr(states, field)[0])
+    assert list(left.session) == [0, 1]
 
 
 def test_the_moving_window_stops_a_stream_that_has_settled():
@@ -272,14 +299,39 @@ def test_a_report_no_truth_could_give_is_named_and_costs_nothing():
     state = learner.init(KEY)
     with pytest.raises(DemonstrationError, match="trajectory 1, step 1"):
         learner.update(state, seen[0])
-    keep = ~np.isclose(seen[1].state, seen[0].state[1, 1])
-    assert keep.any()
-    assert int(state.session) == 0
+    barred = (seen[0].state[1, 1], seen[0].action[1, 1])
+    possible = next(x for x in seen if not ((x.state == barred[0]) & (x.action == barred[1])).any())
+    after, fresh = (learner.update(x, possible)[1] for x in (state, learner.init(KEY)))
+    np.testing.assert_array_equal(after.agreement, fresh.agreement)
+    # In a fleet, which raises nothing, an impossible session leaves everything as it was.
+    assert learner.session is not None
+    left, report = jax.jit(learner.session)(state, seen[0].bucketed())
+    assert np.isneginf(report.demonstration_log_likelihood)
+    for a, b in zip(
+        jax.tree.leaves(left._replace(key=0)), jax.tree.leaves(state._replace(key=0)), strict=True
+    ):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_truths_that_do_not_fit_the_reports_are_named():
+    mdp, seen, truth = stream()
+    learner = rimeo(mdp, task().features, scores="none", truths="oracle")
+    state = learner.init(KEY)
+    with pytest.raises(DemonstrationError, match=r"one shape, got \[1, 3\] and \[2, 3\]"):
+        learner.update(state, WithTruth(seen[0], truth[0].select([0])))
+    lost = truth[0].state.copy()
+    lost[1, 2] = -1
+    with pytest.raises(DemonstrationError, match="trajectory 1, step 2: what happened must be a pair"):
+        learner.update(state, WithTruth(seen[0], truth[0]._replace(state=lost)))
+    with pytest.raises(ValueError, match="memory is an exponent"):
+        rifom(mdp, task().features, memory=2.0)
 
 
 @pytest.mark.parametrize(
     ("options", "message"),
     [
+        ({"start": np.full(3, 0.7)}, r"one for each of 8 predicates, got \[3\]"),
+        ({"view": Visibility(np.ones(1))}, "the MDP has 22 states"),
         ({"scores": "some"}, "scores must be one of"),
         ({"truths": "guess"}, "truths must be one of"),
         ({"errors": -1.0}, "errors must be"),
