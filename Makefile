@@ -36,6 +36,7 @@ bench: $(READY)
 	$(BIN)/python -m i2rl.analysis.benchmarks.stopping
 	$(BIN)/python -m i2rl.analysis.benchmarks.selection
 	$(BIN)/python -m i2rl.analysis.benchmarks.kills
+	$(BIN)/python -m i2rl.analysis.benchmarks.noisy_cost
 
 bench-peers: $(READY) $(PEERS)/.installed
 	$(BIN)/python -m i2rl.analysis.benchmarks.peers --peer-python $(PEERS)/bin/python
