@@ -26,7 +26,8 @@ from ..models.demonstration import HIDDEN, SEEN, UNKNOWN, Demonstration
 from ..models.evidence import FeatureNoise
 from .maxent import quadratic_l1
 
-# A perception that is certain may still be wrong: a score of one would rule out every other truth.
+# A perception that is certain may still be wrong: a score of one would rule out every other truth, and one of
+# zero the truth that was reported.
 CERTAIN = 0.999
 # A logit of more is one error in 160 000.
 LIMIT = 12.0
@@ -152,7 +153,7 @@ def session_reports(
     same = states[..., :, None] & actions[..., None, :] & classes.can_be_reported & seen[..., None, None]
     said = classes.gather(same.astype(float))
     # Beyond certainty nothing is gained, and nothing could be unlearned.
-    score = jnp.where(seen & scored, jnp.clip(score, 0.0, CERTAIN), jnp.nan)
+    score = jnp.where(seen & scored, jnp.clip(score, 1 - CERTAIN, CERTAIN), jnp.nan)
     return SessionReports(kind, said, same, score)
 
 

@@ -98,7 +98,10 @@ def confidences(mode: str, rows: list, mask: np.ndarray) -> Confidences:
         return Confidences(np.full((1, 1), np.nan), np.full(shape, np.nan))
     if mode == "stepwise":
         score = np.array(
-            [[min(step[3], CERTAIN) if step[0] == SEEN else np.nan for step in row] for row in rows]
+            [
+                [np.clip(step[3], 1 - CERTAIN, CERTAIN) if step[0] == SEEN else np.nan for step in row]
+                for row in rows
+            ]
         )
         return Confidences(score[..., None, None], np.broadcast_to(score[..., None], shape))
     averaged = np.random.default_rng(1).uniform(0.2, 0.95, (S, A))
@@ -180,6 +183,13 @@ def test_where_one_pair_alone_can_be_reported_it_is():
     np.testing.assert_allclose(found, 0, atol=1e-12)
 
 
+def test_a_score_of_zero_does_not_rule_out_the_only_truth_there_is():
+    classes = report_classes(FEATURES)
+    reports = session_reports(classes, demonstration([[(SEEN, 1, 0, 0.0)]]))
+    evidence = evidence_of(classes, jnp.asarray(LOGITS), reports, reports.score[..., None, None])
+    np.testing.assert_allclose(np.exp(evidence[0, 0, 1, 0]), 1 - CERTAIN)
+
+
 def test_unscored_evidence_is_that_of_noise_on_features(mask):
     classes = report_classes(FEATURES, mask)
     reports = session_reports(classes, demonstration(ROWS), scored=False)
@@ -235,7 +245,12 @@ def test_scores_are_averaged_by_the_pair_reported():
     found = statistic_of(classes, LOGITS, reports, reports.score[..., None, None], pairs)
     # Those that leave something open have no part.
     expected = np.full((S, A), np.nan)
-    expected[0, 1], expected[1, 0], expected[2, 0], expected[3, 1] = 0.8, 0.55 / 2, 0.3, CERTAIN
+    expected[0, 1], expected[1, 0], expected[2, 0], expected[3, 1] = (
+        0.8,
+        (0.55 + 1 - CERTAIN) / 2,
+        0.3,
+        CERTAIN,
+    )
     np.testing.assert_allclose(found.confidence, expected)
 
 
