@@ -193,8 +193,8 @@ def session_seconds(task: NoisyTask, sessions: int) -> dict[str, dict[str, float
 def part_seconds(task: NoisyTask, sessions: int = 20, runs: int = 200) -> dict[str, float]:
     """Seconds of each part of RIMEO's session, with scores step by step, compiled alone.
 
-    At the state that a learner is in after ``sessions``. The first four occur once more than a session
-    alternates, the others as often.
+    At the state that a learner is in after ``sessions``. Reports are prepared once, the two fits occur
+    as often as a session alternates (twice by default), the others once more.
     """
     stream = stream_of(task, sessions)
     mdp, classes = stream.mdp, report_classes(stream.predicates)
