@@ -20,8 +20,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from ..models.demonstration import Demonstration
-from ..models.evidence import Imperfection, Sensor
+from ..models.demonstration import SEEN, Demonstration, DemonstrationError
+from ..models.evidence import FeatureNoise, Imperfection, Sensor, require_fitting, require_possible
 from ..models.mdp import TabularMDP
 from ..models.planning import deterministic_policy, hard_plan, reward_of, soft_plan
 from .observation_program import Identification, unidentified_predicates
@@ -97,7 +97,8 @@ def sensor_identification(
     Raises
     ------
     ValueError
-        For weights or predicates of the wrong shape.
+        For weights or predicates of the wrong shape, options that do not exist, and a demonstration in which
+        nothing was reported, or something that no truth could give.
     """
     return sensor_identifier(mdp, predicates, **options)(demonstration, weights)
 
@@ -117,51 +118,75 @@ def sensor_identifier(
     ``view``, ``reportable``, ``scores`` and ``errors`` are those of :func:`~i2rl.inference.rimeo`; agreement
     may differ by ``tolerance`` and still be called identified.
     """
+    if scores not in ("stepwise", "averaged", "none"):
+        raise ValueError(f"scores must be one of stepwise, averaged, none, got {scores!r}")
+    if not 0 <= errors < np.inf:
+        raise ValueError(f"errors must be a number of reports, not negative, got {errors}")
     psi = np.asarray(predicates)
-    classes = report_classes(psi, reportable)
+    if psi.ndim != 3 or psi.shape[1:] != mdp.available.shape:
+        raise ValueError(
+            f"predicates have shape [J, S, A] = [J, {mdp.n_states}, {mdp.n_actions}], got {list(psi.shape)}"
+        )
+    seen = Sensor() if view is None else Sensor() * view
+    if seen.reading is not None:
+        raise ValueError("the view says what is hidden; how reports err is fitted, not given")
+    require_fitting(seen, mdp)
+    mask = None if reportable is None else np.asarray(reportable, bool)
+    classes = report_classes(psi, mask)
     perception = entropic_perception(classes, scores, "posterior", errors, 1.0)
-    fit = _fit(mdp, perception, (Sensor() if view is None else Sensor() * view).presence)
+    fit = _fit(mdp, perception, seen.presence)
     slips = mdp.available / mdp.available.sum(1, keepdims=True)
 
     def identify(demonstration: Demonstration, weights: ArrayLike) -> SensorIdentification:
         w = np.asarray(weights, float)
         if w.shape != (mdp.n_features,):
             raise ValueError(f"weights have shape [K] = [{mdp.n_features}], got {list(w.shape)}")
+        if not np.isfinite(w).all():
+            raise ValueError(f"weights must be numbers, got {w}")
+        if not (np.asarray(demonstration.kind) == SEEN).any():
+            raise DemonstrationError("nothing was reported: there is nothing to judge the sensor by")
         session = prepare(mdp, classes, demonstration.bucketed(), perception.scored)
         reward = reward_of(mdp, jnp.asarray(w))
         best = deterministic_policy(hard_plan(mdp, reward).optimal)
         decided = (1 - _ERRS) * best + _ERRS * slips
-        erratic, sure = (
-            np.asarray(fit(session, policy))
-            for policy in (soft_plan(mdp, reward).log_policy, jnp.log(decided))
+        (erratic, likely), (sure, _) = (
+            fit(session, policy) for policy in (soft_plan(mdp, reward).log_policy, jnp.log(decided))
         )
+        if not np.isfinite(likely).all():
+            require_possible(FeatureNoise(psi, np.full(len(psi), 0.5), mask) * seen, mdp, demonstration)
+            raise DemonstrationError("a trajectory has probability zero under the learned policy")
         # Wherever this expert may be: what differs nowhere cannot be told.
         structure = unidentified_predicates(psi, np.asarray(decided), reportable)
-        return SensorIdentification(erratic, sure, structure, tolerance)
+        return SensorIdentification(np.asarray(erratic), np.asarray(sure), structure, tolerance)
 
     return identify
 
 
 def _fit(
     mdp: TabularMDP, perception: Perception, presence: Float[Array, " S"] | None
-) -> Callable[[PreparedSession, Float[Array, "S A"]], Float[Array, " J"]]:
-    """Agreement after the alternation of truths and sensor, the expert's behaviour being given."""
+) -> Callable[[PreparedSession, Float[Array, "S A"]], tuple[Float[Array, " J"], Float[Array, " n"]]]:
+    """Agreement after the alternation of truths and sensor, the expert's behaviour being given.
+
+    With the log-likelihood of each trajectory.
+    """
 
     @jax.jit
-    def fit(session: PreparedSession, log_policy: Float[Array, "S A"]) -> Float[Array, " J"]:
+    def fit(
+        session: PreparedSession, log_policy: Float[Array, "S A"]
+    ) -> tuple[Float[Array, " J"], Float[Array, " n"]]:
         confidence = perception.confidence(perception.empty, session.reports)
 
         def step(_: int, carry: tuple) -> tuple:
-            logits, _agreement = carry
+            logits = carry[0]
             evidence = report_log_evidence(perception.classes, logits, session.reports, confidence, presence)
-            pairs = smooth_all(mdp, log_policy, Evidence(evidence, session.live)).pairs
-            heard = perception.summarise(logits, session, confidence, pairs)
+            truths = smooth_all(mdp, log_policy, Evidence(evidence, session.live))
+            heard = perception.summarise(logits, session, confidence, truths.pairs)
             logits = perception.fit(heard, logits)
-            return logits, perception.agreement(logits, heard)
+            return logits, perception.agreement(logits, heard), truths.log_likelihood
 
         # From a sensor that is right more often than not, about everything alike.
         n_predicates = perception.classes.patterns.shape[1]
-        start = jnp.ones(n_predicates), jnp.zeros(n_predicates)
-        return lax.fori_loop(0, _ITERATIONS, step, start)[1]
+        start = jnp.ones(n_predicates), jnp.zeros(n_predicates), jnp.zeros(len(session.live))
+        return lax.fori_loop(0, _ITERATIONS, step, start)[1:]
 
     return fit

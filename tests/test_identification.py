@@ -12,7 +12,7 @@ from i2rl.domains import noisy_perception
 from i2rl.inference import run_sessions
 from i2rl.inference.identification import sensor_identification
 from i2rl.inference.robust import rimeo
-from i2rl.models.demonstration import concatenate
+from i2rl.models.demonstration import LOST, DemonstrationError, concatenate
 
 KEY = jax.random.key(2)
 
@@ -56,8 +56,22 @@ def test_duplicated_predicates_are_named_and_only_their_product_is_learned():
     )
 
 
-def test_weights_of_another_length_are_refused():
+def test_what_does_not_fit_is_refused():
     task = noisy_perception.noisy_sorting()
     shown = noisy_perception.demonstrate_noisy(KEY, task, sessions=1)
     with pytest.raises(ValueError, match=r"\[K\] = \[11\], got \[3\]"):
         sensor_identification(shown.mdp, task.features, shown.seen, np.ones(3))
+    weights = np.ones(11)
+    with pytest.raises(ValueError, match=r"\[J, S, A\] = \[J, 22, 7\], got \[10, 3, 7\]"):
+        sensor_identification(shown.mdp, task.features[:, :3], shown.seen, weights)
+    with pytest.raises(ValueError, match="scores must be one of"):
+        sensor_identification(shown.mdp, task.features, shown.seen, weights, scores="some")
+    with pytest.raises(ValueError, match="fitted, not given"):
+        sensor_identification(shown.mdp, task.features, shown.seen, weights, view=task.noise)
+    lost = shown.seen._replace(kind=np.full_like(shown.seen.kind, LOST))
+    with pytest.raises(DemonstrationError, match="nothing was reported"):
+        sensor_identification(shown.mdp, task.features, lost, weights)
+    reportable = np.ones(shown.mdp.available.shape, bool)
+    reportable[shown.seen.state[1, 1], shown.seen.action[1, 1]] = False
+    with pytest.raises(DemonstrationError, match=r"trajectory [01], step [012]: impossible"):
+        sensor_identification(shown.mdp, task.features, shown.seen, weights, reportable=reportable)
