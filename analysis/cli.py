@@ -613,6 +613,13 @@ def _print_history(view: Any, records: list[Any], last: int) -> None:
     for name, weight in zip(origin.feature_names, weights, strict=True):
         reward.add_row(name, f"{weight:.3f}", f"{weight / scale:.3f}")
     console.print(reward)
+    if "agreement" in records[-1].report:
+        sensor = Table(title="How often reports agree with the truth")
+        sensor.add_column("predicate")
+        sensor.add_column("agreement", justify="right")
+        for j, agreement in enumerate(records[-1].report["agreement"]):
+            sensor.add_row(str(j), f"{agreement:.3f}")
+        console.print(sensor)
 
 
 def main() -> None:

@@ -38,6 +38,7 @@ from .style import save_themes
 if TYPE_CHECKING:
     from rich.console import Console
 
+LATE = 20
 # At most this share of the constant one half's divergence, early and in the end.
 TARGETS = {PLAIN: (1 / 6, 1 / 12), AVERAGED: (1 / 12, 1 / 24), STEPWISE: (1 / 12, 1 / 24)}
 
@@ -59,7 +60,7 @@ def summary(study: NoisyStudy) -> dict[str, Any]:
                 "method": name,
                 "runs": len(result.weights),
                 "sessions": result.sessions.tolist(),
-                "divergence": _described(result.divergence),
+                "divergence": _described(result.divergence if _quotable(study, name) else None),
                 "accuracy": {states: _described(result.accuracy[..., i]) for i, states in enumerate(STATES)},
             }
             for name, result in study.results.items()
@@ -107,19 +108,19 @@ def _with_interval(runs: Float[np.ndarray, " runs"], scale: float = 1.0, digits:
 def sensor_table(study: NoisyStudy) -> Table:
     """Divergence of every estimate early and in the end, and as a share of the control."""
     rows = [("constant one half", f"{study.control:.4f}", "1", "", f"{study.control:.4f}", "1", "")]
-    unknown = not _identified(study, PLAIN)
     early, late = min(EARLY, study.sessions), study.sessions
     for name, result in study.results.items():
         if result.divergence is None:
             continue
-        if unknown and name in (PLAIN, BARE):
+        if not _quotable(study, name):
             rows.append((name, *("not identified", "", "") * 2))
             continue
         cells: list[str] = [name]
         for which, session in enumerate((early, late)):
             values = result.divergence[:, session - 1]
             share = values.mean() / study.control
-            target = TARGETS[name][which] if name in TARGETS and study.starts == "all" else None
+            aimed = name in TARGETS and study.starts == "all" and session == (EARLY, LATE)[which]
+            target = TARGETS[name][which] if aimed else None
             met = "" if target is None else f"1/{1 / target:.0f}: {'met' if share <= target else 'missed'}"
             cells += [_with_interval(values, digits=4), f"{share:.3f}", met]
         rows.append(tuple(cells))  # type: ignore[arg-type]
@@ -138,6 +139,11 @@ def sensor_table(study: NoisyStudy) -> Table:
 def _identified(study: NoisyStudy, method: str) -> bool:
     """Whether the sensor is known in at least half of the runs; what was not asked is not doubted."""
     return method not in study.doubt or study.doubt[method].known >= 0.5
+
+
+def _quotable(study: NoisyStudy, method: str) -> bool:
+    """Whether an estimate of the sensor may be quoted: one without scores only if such a sensor is known."""
+    return method not in (PLAIN, BARE) or _identified(study, PLAIN)
 
 
 def doubt_table(study: NoisyStudy) -> Table:

@@ -27,6 +27,7 @@ from ..models.planning import deterministic_policy, hard_plan, reward_of, soft_p
 from .observation_program import Identification, unidentified_predicates
 from .perception import Perception, PreparedSession, entropic_perception, prepare
 from .reports import report_classes, report_log_evidence
+from .robust import DEFAULT_START, _first_logits
 from .smoothing import Evidence, smooth_all
 
 # How often the decided expert still errs, so that nothing is ruled out.
@@ -134,7 +135,7 @@ def sensor_identifier(
     mask = None if reportable is None else np.asarray(reportable, bool)
     classes = report_classes(psi, mask)
     perception = entropic_perception(classes, scores, "posterior", errors, 1.0)
-    fit = _fit(mdp, perception, seen.presence)
+    fit = _fit(mdp, perception, seen.presence, _first_logits(psi, DEFAULT_START))
     slips = mdp.available / mdp.available.sum(1, keepdims=True)
 
     def identify(demonstration: Demonstration, weights: ArrayLike) -> SensorIdentification:
@@ -163,7 +164,10 @@ def sensor_identifier(
 
 
 def _fit(
-    mdp: TabularMDP, perception: Perception, presence: Float[Array, " S"] | None
+    mdp: TabularMDP,
+    perception: Perception,
+    presence: Float[Array, " S"] | None,
+    first_logits: Float[Array, " J"],
 ) -> Callable[[PreparedSession, Float[Array, "S A"]], tuple[Float[Array, " J"], Float[Array, " n"]]]:
     """Agreement after the alternation of truths and sensor, the expert's behaviour being given.
 
@@ -184,9 +188,7 @@ def _fit(
             logits = perception.fit(heard, logits)
             return logits, perception.agreement(logits, heard), truths.log_likelihood
 
-        # From a sensor that is right more often than not, about everything alike.
-        n_predicates = perception.classes.patterns.shape[1]
-        start = jnp.ones(n_predicates), jnp.zeros(n_predicates), jnp.zeros(len(session.live))
-        return lax.fori_loop(0, _ITERATIONS, step, start)[1:]
+        begun = first_logits, jnp.zeros_like(first_logits), jnp.zeros(len(session.live))
+        return lax.fori_loop(0, _ITERATIONS, step, begun)[1:]
 
     return fit

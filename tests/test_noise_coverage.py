@@ -13,7 +13,6 @@ from i2rl.analysis.coverage import (
     ignorance_gap,
     simulate_codes,
 )
-from i2rl.analysis.perception_bounds import rimeo_confidence
 from i2rl.analysis.noise_coverage import (
     complete_under,
     counted_reliabilities,
@@ -21,6 +20,7 @@ from i2rl.analysis.noise_coverage import (
     perception_coverage,
     posterior_change,
 )
+from i2rl.analysis.perception_bounds import rimeo_confidence
 from i2rl.analysis.perception_distance import Perception
 from i2rl.models import FeatureNoise, Visibility
 
