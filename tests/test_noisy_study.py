@@ -213,10 +213,11 @@ def test_command_writes_its_page(tmp_path, monkeypatch):
 
 
 def test_where_the_experts_errors_could_be_the_sensors_no_number_is_quoted():
-    natural = noisy_study.study(
-        "sorting", runs=2, sessions=20, starts="natural", belts=1, draws=0, methods=()
-    )
-    assert natural.doubt[noisy_study.PLAIN].known < 0.5
-    row = next(r for r in noisy_report.sensor_table(natural).rows if r[0] == noisy_study.PLAIN)
+    shares = np.ones((2, len(task().predicates)))
+    doubt = noisy_study.SensorDoubt(shares, shares - 0.2, np.zeros(shares.shape, bool))
+    study = small()._replace(doubt={PLAIN: doubt})
+    row = next(r for r in noisy_report.sensor_table(study).rows if r[0] == PLAIN)
     assert row[1] == "not identified"
     assert not any(character.isdigit() for cell in row[1:] for character in str(cell))
+    kept = {m["method"]: m["divergence"] for m in noisy_report.summary(study)["methods"]}
+    assert kept[PLAIN] is None
