@@ -36,7 +36,7 @@ from .mixture_fit import (
     nothing_kept,
 )
 from .mixture_search import Search, search
-from .session import Learner
+from .session import Learner, in_plain_numbers
 
 DEFAULT_WAYS = 4
 DEFAULT_RESTARTS = 4
@@ -192,11 +192,11 @@ def mme_mtirl(
         new, report = _concluded(program, state, *_begin(program, state, jumble, restarts, _searched))
         if not np.isfinite(report.demonstration_log_likelihood):
             _explain_impossible(sensor, mdp, demonstration)
-        arrays = {name: np.asarray(value) for name, value in report._asdict().items()}
-        arrays["assignments"] = arrays["assignments"][rows]
-        arrays["responsibilities"] = arrays["responsibilities"][rows]
-        plain: dict[str, Any] = {name: x if x.ndim else x.item() for name, x in arrays.items()}
-        return new, MixtureReport(**plain | {"seconds": time.perf_counter() - began})
+        report = report._replace(
+            assignments=np.asarray(report.assignments)[rows],
+            responsibilities=np.asarray(report.responsibilities)[rows],
+        )
+        return new, in_plain_numbers(report, time.perf_counter() - began)
 
     @jax.jit
     def likelihood(state: MixtureState, weights: Float[Array, "D K"]) -> Float[Array, ""]:

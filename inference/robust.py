@@ -43,7 +43,7 @@ from .perception import (
 from .programs import host_solver
 from .reports import report_classes, report_log_evidence
 from .schedule import Schedule, described, require_slack_in
-from .session import Learner
+from .session import Learner, in_plain_numbers
 from .smoothing import Evidence, smooth_all
 from .statistic import blend, complete
 
@@ -495,7 +495,7 @@ def _learner(
 
     def update(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOReport]:
         began = time.perf_counter()
-        seen = _checked_session(name, demonstration, scores_needed, "oracle" in name)
+        seen = _checked_session(name, demonstration, scores_needed, configuration.get("truths") == "oracle")
         if isinstance(demonstration, WithTruth):
             _require_truth(mdp, demonstration)
         require_slack_in(method.slack, int(state.session) + 1)
@@ -506,9 +506,7 @@ def _learner(
         if not np.isfinite(report.demonstration_log_likelihood):
             require_possible(reporting * method.sensor, mdp, seen)
             raise DemonstrationError("a trajectory has probability zero under the current policy")
-        arrays = {field: np.asarray(value) for field, value in report._asdict().items()}
-        plain: dict[str, Any] = {field: x if x.ndim else x.item() for field, x in arrays.items()}
-        return new, RIMEOReport(**plain | {"seconds": time.perf_counter() - began})
+        return new, in_plain_numbers(report, time.perf_counter() - began)
 
     @jax.jit
     def likelihood(state: RIMEOState, weights: Float[Array, " K"]) -> Float[Array, ""]:
@@ -550,9 +548,10 @@ def _outside(
                 break
             slack, ridge = method.penalties(expected.working, state.session + 1)
             solution, rewards = solve(expected.working, slack, ridge, rewards)
-            logits = perception.fit(expected.reports, point.logits)
             if perception.fit_outside is not None and expected.reports.size > 0:
                 logits, sensor = perception.fit_outside(expected.reports, sensor)
+            else:
+                logits = perception.fit(expected.reports, point.logits)
             reward = WarmStart(jnp.asarray(solution.weights), jnp.asarray(solution.values))
             point = advance(point, expected, logits, _Solved(*reward, jnp.asarray(solution.iterations)))
         new, report = closing(state, prepared, confidence, point, ())

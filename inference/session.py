@@ -12,7 +12,7 @@ import hashlib
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,9 @@ from ..models.planning import deterministic_policy, hard_plan, policy_values, re
 
 if TYPE_CHECKING:
     from .journal import Journal
+
+
+AnyReport = TypeVar("AnyReport", bound=tuple)
 
 
 class Report(NamedTuple):
@@ -66,9 +69,14 @@ class Report(NamedTuple):
 
     def in_plain_numbers(self, seconds: float) -> Report:
         """The report of a compiled session with Python's numbers and NumPy's arrays, and the time it took."""
-        arrays = {name: np.asarray(value) for name, value in self._asdict().items()}
-        values: dict[str, Any] = {name: x if x.ndim else x.item() for name, x in arrays.items()}
-        return Report(**values | {"seconds": seconds})
+        return in_plain_numbers(self, seconds)
+
+
+def in_plain_numbers(report: AnyReport, seconds: float) -> AnyReport:
+    """A learner's own kind of report in the same form: any named tuple with a field ``seconds``."""
+    arrays = {name: np.asarray(value) for name, value in report._asdict().items()}  # type: ignore[attr-defined]
+    values: dict[str, Any] = {name: x if x.ndim else x.item() for name, x in arrays.items()}
+    return type(report)(**values | {"seconds": seconds})
 
 
 class Learner(NamedTuple):
