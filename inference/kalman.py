@@ -1,0 +1,189 @@
+"""Exact inference in affine-Gaussian chains that change from step to step (Kalman 1960; Rauch et al. 1965).
+
+The chain is ``x_0 ~ N(m, P)``, ``x_{t+1} = F_t x_t + b_t + N(0, Q_t)``, read as ``y_t = H x_t + N(0, R_t)``.
+Covariances are sums of squares throughout (Joseph's form), which keeps them positive definite where ``Q_t``
+is nearly singular; what is inverted is inverted by Cholesky factors. 64-bit floats.
+
+Functions take one chain. ``jax.lax.map`` does several; ``jax.vmap`` would too, but batches of small
+factorisations inside a loop are slow on a CPU.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.linalg import cho_solve
+from jaxtyping import Array, Bool, Float
+
+
+class AffineGaussian(NamedTuple):
+    """An affine-Gaussian chain of ``L`` steps.
+
+    Fields
+    ------
+    mean, covariance : float ``[D]``, ``[D, D]``
+        Of the first state.
+    transition, offset, noise : float ``[L - 1, D, D]``, ``[L - 1, D]``, ``[L - 1, D, D]``
+        ``F_t``, ``b_t`` and ``Q_t``.
+    reading, reading_noise : float ``[m, D]``, ``[L, m, m]``
+        ``H`` and ``R_t``.
+    """
+
+    mean: Float[Array, " D"]
+    covariance: Float[Array, "D D"]
+    transition: Float[Array, "T D D"]
+    offset: Float[Array, "T D"]
+    noise: Float[Array, "T D D"]
+    reading: Float[Array, "m D"]
+    reading_noise: Float[Array, "L m m"]
+
+
+class GaussianFiltered(NamedTuple):
+    """Forward pass, and the law of each state given the next: ``x_t | x_{t+1}, y_{0:t} ~
+    N(means_t + gains_t (x_{t+1} - predicted_{t+1}), conditional_t)``.
+
+    Fields
+    ------
+    log_likelihood : float, in nats
+    means, covariances : float ``[L, D]``, ``[L, D, D]``
+        Of ``x_t`` given ``y_{0:t}``.
+    predicted : float ``[L - 1, D]``
+        Mean of ``x_{t+1}`` given ``y_{0:t}``.
+    gains, conditional : float ``[L - 1, D, D]``
+    """
+
+    log_likelihood: Float[Array, ""]
+    means: Float[Array, "L D"]
+    covariances: Float[Array, "L D D"]
+    predicted: Float[Array, "T D"]
+    gains: Float[Array, "T D D"]
+    conditional: Float[Array, "T D D"]
+
+
+class GaussianSmoothed(NamedTuple):
+    """Posterior of a chain given all readings.
+
+    Fields
+    ------
+    log_likelihood : float, in nats
+    means, covariances : float ``[L, D]``, ``[L, D, D]``
+    lagged : float ``[L - 1, D, D]``
+        ``Cov(x_{t+1}, x_t)``.
+    """
+
+    log_likelihood: Float[Array, ""]
+    means: Float[Array, "L D"]
+    covariances: Float[Array, "L D D"]
+    lagged: Float[Array, "T D D"]
+
+
+def _symmetric(matrix: Array) -> Array:
+    return 0.5 * (matrix + matrix.swapaxes(-1, -2))
+
+
+def filter_gaussian(
+    chain: AffineGaussian, readings: Float[Array, "L m"], read: Bool[Array, " L"]
+) -> GaussianFiltered:
+    """Forward pass; where ``read`` is false (padding, or a step not reported) there is no reading."""
+    identity = jnp.eye(chain.mean.shape[0])
+    H = chain.reading
+
+    def update(mean: Array, covariance: Array, y: Array, R: Array, there: Array) -> tuple:
+        S = jnp.linalg.cholesky(H @ covariance @ H.T + R)
+        error = y - H @ mean
+        whitened = jax.scipy.linalg.solve_triangular(S, error, lower=True)
+        gain = cho_solve((S, True), H @ covariance).T
+        kept = identity - gain @ H
+        log_p = -0.5 * (whitened @ whitened + len(error) * jnp.log(2 * jnp.pi)) - jnp.sum(
+            jnp.log(jnp.diagonal(S))
+        )
+        return (
+            jnp.where(there, mean + gain @ error, mean),
+            jnp.where(there, _symmetric(kept @ covariance @ kept.T + gain @ R @ gain.T), covariance),
+            jnp.where(there, log_p, 0.0),
+        )
+
+    def step(carry: tuple, inputs: tuple) -> tuple:
+        mean, covariance, total = carry
+        F, b, Q, y, R, there = inputs
+        predicted = F @ mean + b
+        ahead = _symmetric(F @ covariance @ F.T + Q)
+        gain = cho_solve((jnp.linalg.cholesky(ahead), True), F @ covariance).T
+        kept = identity - gain @ F
+        conditional = _symmetric(kept @ covariance @ kept.T + gain @ Q @ gain.T)
+        following, spread, log_p = update(predicted, ahead, y, R, there)
+        return (following, spread, total + log_p), (following, spread, predicted, gain, conditional)
+
+    first = update(chain.mean, chain.covariance, readings[0], chain.reading_noise[0], read[0])
+    inputs = (
+        chain.transition,
+        chain.offset,
+        chain.noise,
+        readings[1:],
+        chain.reading_noise[1:],
+        read[1:],
+    )
+    passed: tuple = lax.scan(step, first, inputs)
+    (_, _, total), (means, covariances, predicted, gains, conditional) = passed
+    return GaussianFiltered(
+        total,
+        jnp.concatenate([first[0][None], means]),
+        jnp.concatenate([first[1][None], covariances]),
+        predicted,
+        gains,
+        conditional,
+    )
+
+
+def smooth_filtered(filtered: GaussianFiltered) -> GaussianSmoothed:
+    """Backward pass of Rauch, Tung and Striebel."""
+
+    def step(carry: tuple, inputs: tuple) -> tuple:
+        following, spread = carry
+        mean, predicted, gain, conditional = inputs
+        mean = mean + gain @ (following - predicted)
+        covariance = _symmetric(conditional + gain @ spread @ gain.T)
+        return (mean, covariance), (mean, covariance, spread @ gain.T)
+
+    last = filtered.means[-1], filtered.covariances[-1]
+    inputs = (filtered.means[:-1], filtered.predicted, filtered.gains, filtered.conditional)
+    smoothed: tuple = lax.scan(step, last, inputs, reverse=True)[1]
+    means, covariances, lagged = smoothed
+    return GaussianSmoothed(
+        filtered.log_likelihood,
+        jnp.concatenate([means, last[0][None]]),
+        jnp.concatenate([covariances, last[1][None]]),
+        lagged,
+    )
+
+
+def smooth_gaussian(
+    chain: AffineGaussian, readings: Float[Array, "L m"], read: Bool[Array, " L"]
+) -> GaussianSmoothed:
+    """Both passes; ``read`` as for :func:`filter_gaussian`."""
+    return smooth_filtered(filter_gaussian(chain, readings, read))
+
+
+def sample_filtered(key: Array, filtered: GaussianFiltered, draws: int) -> Float[Array, "draws L D"]:
+    """Independent joint draws of the whole chain given all readings, backwards from the last state."""
+    length, size = filtered.means.shape
+    noise = jax.random.normal(key, (length, draws, size), filtered.means.dtype)
+
+    def step(following: Array, inputs: tuple) -> tuple:
+        mean, predicted, gain, conditional, z = inputs
+        drawn = mean + (following - predicted) @ gain.T + z @ _root(conditional).T
+        return drawn, drawn
+
+    last = filtered.means[-1] + noise[-1] @ _root(filtered.covariances[-1]).T
+    inputs = (filtered.means[:-1], filtered.predicted, filtered.gains, filtered.conditional, noise[:-1])
+    drawn: Array = lax.scan(step, last, inputs, reverse=True)[1]
+    return jnp.concatenate([drawn, last[None]]).swapaxes(0, 1)
+
+
+def _root(covariance: Float[Array, "D D"]) -> Float[Array, "D D"]:
+    """A Cholesky factor, of a covariance that rounding may have left a hair short of positive definite."""
+    slack = 1e-14 * jnp.trace(covariance) * jnp.eye(covariance.shape[0])
+    return jnp.linalg.cholesky(covariance + slack)
