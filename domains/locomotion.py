@@ -100,18 +100,21 @@ class Locomotion(NamedTuple):
         return _simulator(self.name, self.threads).seconds
 
     def reset(self, key: Array, n: int) -> Float[np.ndarray, "n D"]:
-        """First states of ``n`` robots, the first of which are the same whatever ``n``."""
+        """First states of ``n`` robots, the first of which are the same whatever ``n``.
+
+        They are 32-bit numbers, so that the first observation of a recording says them exactly (but ``x``).
+        """
         simulator, task = _simulator(self.name, self.threads), _TASKS[self.name]
         positions, velocities = np.random.default_rng(np.asarray(_data_of(key))).spawn(2)
         nq, nv, noise = simulator.model.nq, simulator.model.nv, task.reset_noise
-        states = np.zeros((n, simulator.state_size))
+        states = np.zeros((n, simulator.state_size), np.float32)
         states[:, 1 : 1 + nq] = simulator.model.qpos0 + positions.uniform(-noise, noise, (n, nq))
         states[:, 1 + nq :] = (
             noise * velocities.standard_normal((n, nv))
             if task.normal_velocities
             else velocities.uniform(-noise, noise, (n, nv))
         )
-        return states
+        return states.astype(np.float64)
 
     def step(
         self, states: Float[np.ndarray, "n D"], actions: Float[np.ndarray, "n k"]
