@@ -124,7 +124,12 @@ def gail_discriminator(
     *,
     hidden: Sequence[int] = (64, 64),
 ) -> Discriminator:
-    """A free classifier of state and action; the generator earns ``-log(1 - D)`` (Ho and Ermon 2016)."""
+    """A free classifier of state and action (Ho and Ermon 2016).
+
+    The generator earns ``log D - log(1 - D)``. Of ``log D`` every step costs something, and of
+    ``-log(1 - D)`` every step pays, so that they teach to end episodes, or to prolong them, whatever the
+    expert does (Kostrikov et al. 2019).
+    """
 
     def init(key: Array) -> ShapedReward:
         return ShapedReward.create(
@@ -132,8 +137,8 @@ def gail_discriminator(
         )
 
     def rewards(network: ShapedReward, policy: Policy, steps: Transitions) -> Array:
-        own = jax.nn.softplus(network(steps.observations, steps.actions))
-        return own + _for_ever(jax.nn.softplus(network.absorbing), discount) * steps.terminated
+        own = network(steps.observations, steps.actions)
+        return own + _for_ever(network.absorbing, discount) * steps.terminated
 
     return Discriminator(
         "GAIL",

@@ -1,0 +1,409 @@
+"""Adversarial learners of rewards and policies as networks: AIRL, GAIL and robust-AIRL (chapter 6.2).
+
+One learner with three parts to choose: the discriminator (what the reward is), the generator (who acts, and
+how it improves) and the truth (what the expert did, given the reports). AIRL on clean or noisy input takes
+reports at face value; robust-AIRL (Algorithm 3) samples what is behind them.
+
+Between sessions everything is carried: the reward network, its optimiser and normaliser, the generator with
+its own, generated steps, the sensor and the key. Of demonstrations nothing is (Definition 7).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ..models.extras import required
+from ..models.networks import DTYPE, ActionSpace, Policy, ShapedReward
+from ..models.sensing import Recording
+from .discriminator import (
+    AVERAGES,
+    Discriminator,
+    ExpertTransitions,
+    Losses,
+    Transitions,
+    cross_entropy,
+    gradient_penalty,
+)
+from .rollouts import finished_returns
+from .session import Learner
+
+if TYPE_CHECKING:
+    import equinox as eqx
+    import optax
+else:
+    eqx, optax = required("equinox"), required("optax")
+
+
+class Task(NamedTuple):
+    """What a learner is about where there is no :class:`TabularMDP`: sizes and a name, for its journal."""
+
+    name: str
+    observation_size: int
+    actions: ActionSpace
+
+    n_states: int = 0
+    feature_names: tuple[str, ...] = ()
+
+    @property
+    def n_actions(self) -> int:
+        """How many actions there are; of vectors, how long they are."""
+        return self.actions.size
+
+    def fingerprint(self) -> str:
+        """Digest of all fields."""
+        return hashlib.sha256(json.dumps(tuple(self)).encode()).hexdigest()
+
+
+class Truth(Protocol):
+    """What the expert did, given reports: one object for each way to deal with noise."""
+
+    def prior(self) -> Any:
+        """The sensor before the first session, as arrays (empty where there is nothing to know)."""
+
+    def begin(self, recording: Recording, sensor: Any, key: Array) -> Any:
+        """The chain's state before the first look at a session's reports."""
+
+    def refresh(self, chain: Any, sensor: Any, policy: Policy, key: Array) -> tuple[Any, ExpertTransitions]:
+        """Samples of the truth under the current policy, and the chain to go on from."""
+
+    def learned(self, chain: Any, sensor: Any) -> Any:
+        """The sensor after a session: as it was, or fitted to it."""
+
+
+class AdversarialState(NamedTuple):
+    """All that is carried from session to session.
+
+    Fields
+    ------
+    session : int
+    key : random key
+    network : ShapedReward
+    optimiser : state of the discriminator's optimiser
+    generator : state of the generator, with its ``policy``
+    replay : Transitions, generated in the last rounds, ``[K, B, ...]``
+    rounds, pairs : int; rounds of training and reported pairs so far
+    sensor : the truth's
+    """
+
+    session: Int[Array, ""]
+    key: Array
+    network: ShapedReward
+    optimiser: Any
+    generator: Any
+    replay: Transitions
+    rounds: Int[Array, ""]
+    pairs: Int[Array, ""]
+    sensor: Any
+
+    @property
+    def weights(self) -> Float[np.ndarray, " P"]:
+        """All parameters of the reward network in one vector."""
+        parameters = (self.network.reward, self.network.potential, self.network.absorbing)
+        return np.concatenate([np.ravel(x) for x in jax.tree.leaves(parameters)])
+
+
+class AdversarialReport(NamedTuple):
+    """What a session did.
+
+    Fields
+    ------
+    session : int
+    log_likelihood : float
+        Of the expert's actions under the generator's policy, nats a step, averaged over the truth's samples
+        of the session's last round.
+    loss, expert_accuracy, generated_accuracy : float ``[rounds]``
+        Of the discriminator: cross-entropy in nats, and the shares told right.
+    returns : float ``[rounds]``
+        Mean return, by the environment's own reward, of the episodes that the generator finished; NaN where
+        none ended. Learning never sees it.
+    pairs, environment_steps : int
+        Reported pairs, and steps of the generator, in all sessions so far.
+    iterations : int
+        Rounds of this session.
+    sensor : the truth's sensor after the session
+    seconds : float
+    weights : float ``[P]``
+    """
+
+    session: int
+    log_likelihood: float
+    loss: Float[np.ndarray, " rounds"]
+    expert_accuracy: Float[np.ndarray, " rounds"]
+    generated_accuracy: Float[np.ndarray, " rounds"]
+    returns: Float[np.ndarray, " rounds"]
+    pairs: int
+    environment_steps: int
+    iterations: int
+    sensor: Any
+    seconds: float
+    weights: Float[np.ndarray, " P"]
+
+
+class FaceValue:
+    """Reports taken for the truth: AIRL and GAIL as they are, on clean or noisy input."""
+
+    def prior(self) -> tuple:
+        """Nothing."""
+        return ()
+
+    def begin(self, recording: Recording, sensor: tuple, key: Array) -> Recording:
+        """The reports."""
+        return recording
+
+    def refresh(
+        self, chain: Recording, sensor: tuple, policy: Policy, key: Array
+    ) -> tuple[Recording, ExpertTransitions]:
+        """The reports as one sample."""
+        return chain, reported_steps(chain)
+
+    def learned(self, chain: Recording, sensor: tuple) -> tuple:
+        """Nothing."""
+        return sensor
+
+
+class Training(NamedTuple):
+    """How a session trains.
+
+    Fields
+    ------
+    rounds : int, of generator and discriminator, in a session
+    updates : int, of the discriminator in a round
+    batch : int, expert steps (and as many generated ones) an update
+    learning_rate : float, of the discriminator's Adam
+    average : "log_probabilities" (the objective of section 6.2.1) or "logits" (as released)
+    penalty : float, of the gradient (see :func:`gradient_penalty`)
+    replay : int, rounds whose generated steps the discriminator draws from
+    refresh : int, rounds between looks at the truth
+    """
+
+    rounds: int = 10
+    updates: int = 4
+    batch: int = 256
+    learning_rate: float = 1e-3
+    average: str = "log_probabilities"
+    penalty: float = 1.0
+    replay: int = 1
+    refresh: int = 1
+
+    def checked(self) -> Training:
+        """Itself. Raises ``ValueError`` naming a field that cannot be."""
+        for name in ("rounds", "updates", "batch", "replay", "refresh"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.average not in AVERAGES:
+            raise ValueError(f"average is one of {', '.join(AVERAGES)}, got {self.average!r}")
+        return self
+
+
+def adversarial(
+    name: str,
+    generator: Any,
+    discriminator: Discriminator,
+    truth: Truth | None = None,
+    training: Training | None = None,
+    configuration: Mapping[str, Any] | None = None,
+) -> Learner:
+    """A learner of the session protocol from its parts; its demonstrations are :class:`Recording`.
+
+    ``generator`` is a :class:`PPO`, or has as it does an ``environment``, ``settings``, ``init(key)``,
+    ``collect(state)`` and ``improve(state, rollout, rewards)``, and states with a ``policy``. ``truth`` is
+    :class:`FaceValue` by default. Recordings of one shape are compiled for once.
+    """
+    environment = generator.environment
+    task = Task(environment.name, environment.observation_size, environment.actions)
+    truth = FaceValue() if truth is None else truth
+    how = (training or Training()).checked()
+    optimiser = optax.adam(how.learning_rate)
+    trained = _discriminator_updates(discriminator, optimiser, how)
+
+    @jax.jit
+    def rewarded(network: ShapedReward, policy: Policy, rollout: Any) -> Float[Array, "T n"]:
+        return discriminator.rewards(network, policy, _steps(task, rollout))
+
+    @jax.jit
+    def likelihood(policy: Policy, expert: ExpertTransitions) -> Float[Array, ""]:
+        each = policy.log_prob(expert.steps.observations, expert.steps.actions) @ expert.weights
+        return jnp.sum(jnp.where(expert.live, each, 0)) / jnp.sum(expert.live)
+
+    def init(key: Array) -> AdversarialState:
+        k_network, k_generator, k_rest = jax.random.split(key, 3)
+        network = discriminator.init(k_network)
+        acting = generator.init(k_generator)
+        blank = _blank(task, (how.replay, generator.settings.steps))
+        zero = jnp.zeros((), jnp.int64)
+        parts = (network, optimiser.init(_trainable(network)), acting, blank, zero, zero, truth.prior())
+        return AdversarialState(zero, k_rest, *parts)
+
+    def update(state: AdversarialState, recording: Recording) -> tuple[AdversarialState, AdversarialReport]:
+        began = time.perf_counter()
+        key, k_chain = jax.random.split(state.key)
+        network, memory, acting = state.network, state.optimiser, state.generator
+        replay, sensor, rounds = state.replay, state.sensor, int(state.rounds)
+        chain = truth.begin(recording, sensor, k_chain)
+        losses, returns, expert = [], [], None
+        for r in range(how.rounds):
+            key, k_truth, k_updates = jax.random.split(key, 3)
+            policy = acting.policy
+            if expert is None or r % how.refresh == 0:
+                chain, expert = truth.refresh(chain, sensor, policy, k_truth)
+            before = acting.running
+            acting, rollout = generator.collect(acting)
+            replay = _remembered(replay, _steps(task, rollout), (rounds + r) % how.replay)
+            filled = min(rounds + r + 1, how.replay)
+            network, memory, met = trained(network, memory, policy, expert, replay, filled, k_updates)
+            acting = generator.improve(acting, rollout, rewarded(network, policy, rollout))
+            losses.append(met)
+            ended = finished_returns(before, rollout)
+            returns.append(ended.mean() if len(ended) else np.nan)
+        assert expert is not None
+        sensor = truth.learned(chain, sensor)
+        pairs = state.pairs + int(np.sum(recording.live))
+        rounds += how.rounds
+        state = AdversarialState(
+            state.session + 1,
+            key,
+            network,
+            memory,
+            acting,
+            replay,
+            jnp.asarray(rounds),
+            pairs,
+            sensor,
+        )
+        met: Losses = jax.tree.map(lambda *x: np.asarray(x, np.float64), *losses)
+        report = AdversarialReport(
+            session=int(state.session),
+            log_likelihood=float(likelihood(acting.policy, expert)),
+            **met._asdict(),
+            returns=np.asarray(returns, np.float64),
+            pairs=int(pairs),
+            environment_steps=rounds * int(np.prod(replay.terminated.shape[1:])),
+            iterations=how.rounds,
+            sensor=jax.tree.map(np.asarray, sensor),
+            seconds=time.perf_counter() - began,
+            weights=state.weights,
+        )
+        return state, report
+
+    settings = {"discriminator": discriminator.name, **how._asdict(), **dict(configuration or {})}
+    return Learner(name, task, settings, init, update)  # type: ignore[arg-type]
+
+
+# -- a round's parts ------------------------------------------------------------------------------------
+
+
+def reported_steps(recording: Recording) -> ExpertTransitions:
+    """The reports as transitions: of each trajectory all steps with a successor, or a termination."""
+    observations = jnp.asarray(recording.observations)
+    following = jnp.concatenate([observations[:, 1:], observations[:, -1:]], 1)
+    ends = recording.last & recording.terminated[:, None]
+    steps = (observations, jnp.asarray(recording.actions), following, ends)
+    flat = (x.reshape(-1, 1, *x.shape[2:]) for x in steps)
+    return ExpertTransitions(Transitions(*flat), (recording.followed | ends).reshape(-1), jnp.ones(1))
+
+
+def _steps(task: Task, rollout: Any) -> Transitions:
+    return Transitions(
+        rollout.observations,
+        task.actions.clip(rollout.actions),
+        rollout.next_observations,
+        rollout.terminated,
+    )
+
+
+def _blank(task: Task, shape: tuple[int, int]) -> Transitions:
+    d = task.observation_size
+    observations = jnp.zeros((*shape, d), DTYPE)
+    if task.actions.discrete:
+        actions = jnp.zeros(shape, jnp.int32)
+    else:
+        actions = jnp.zeros((*shape, task.actions.size), DTYPE)
+    return Transitions(observations, actions, observations, jnp.zeros(shape, bool))
+
+
+@jax.jit
+def _remembered(replay: Transitions, new: Transitions, place: int) -> Transitions:
+    return Transitions(
+        *(old.at[place].set(x.reshape(old.shape[1:])) for old, x in zip(replay, new, strict=True))
+    )
+
+
+def _trainable(network: ShapedReward) -> tuple:
+    return network.reward, network.potential, network.absorbing
+
+
+def _with(network: ShapedReward, parameters: tuple) -> ShapedReward:
+    return eqx.tree_at(_trainable, network, parameters)
+
+
+def _normed(network: ShapedReward, *observations: Array) -> ShapedReward:
+    norm = network.norm
+    for x in observations:
+        norm = norm.update(x)
+    return eqx.tree_at(lambda net: net.norm, network, norm)
+
+
+def _discriminator_updates(
+    discriminator: Discriminator, optimiser: Any, how: Training
+) -> Callable[..., tuple[ShapedReward, Any, Losses]]:
+    """All of a round's updates in one compiled program; the losses are those of the last."""
+
+    @jax.jit
+    def trained(
+        network: ShapedReward,
+        memory: Any,
+        policy: Policy,
+        expert: ExpertTransitions,
+        replay: Transitions,
+        filled: int,
+        key: Array,
+    ) -> tuple[ShapedReward, Any, Losses]:
+        # Live rows first, so that drawing one is drawing a number below their count.
+        order, count = jnp.argsort(~expert.live, stable=True), jnp.sum(expert.live)
+        recent, size = replay.terminated.shape
+
+        def drawn(key: Array) -> tuple[Transitions, Transitions]:
+            k_expert, k_generated = jax.random.split(key)
+            rows = order[jax.random.randint(k_expert, (how.batch,), 0, count)]
+            places = jax.random.randint(k_generated, (how.batch,), 0, filled * size)
+            flat = Transitions(*(x.reshape(recent * size, *x.shape[2:]) for x in replay))
+            return expert.steps.rows(rows), flat.rows(places)
+
+        k_norm, k_updates = jax.random.split(key)
+        ours, theirs = drawn(k_norm)
+        network = _normed(network, ours.observations[:, 0], theirs.observations)
+
+        def step(carry: tuple, key: Array) -> tuple:
+            parameters, memory = carry
+            k_batch, k_penalty = jax.random.split(key)
+            ours, theirs = drawn(k_batch)
+
+            def objective(parameters: tuple) -> tuple[Array, Losses]:
+                net = _with(network, parameters)
+                loss, met = cross_entropy(
+                    discriminator, net, policy, ours, expert.weights.astype(jnp.float32), theirs, how.average
+                )
+                if how.penalty:
+                    first = Transitions(*(x[:, 0] for x in ours))
+                    loss += how.penalty * gradient_penalty(discriminator, net, first, theirs, k_penalty)
+                return loss, met
+
+            slope, met = jax.grad(objective, has_aux=True)(parameters)
+            change, memory = optimiser.update(slope, memory, parameters)
+            return (optax.apply_updates(parameters, change), memory), met
+
+        keys = jax.random.split(k_updates, how.updates)
+        (parameters, memory), met = lax.scan(step, (_trainable(network), memory), keys)
+        return _with(network, parameters), memory, Losses(*(x[-1] for x in met))
+
+    return trained
