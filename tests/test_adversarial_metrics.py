@@ -22,8 +22,8 @@ from i2rl.analysis.adversarial_metrics import (
     reward_correlation,
     seed_interval,
 )
-from i2rl.analysis.episodes import Perturbed, graded_mix, simulate
 from i2rl.domains.control import cart_pole, mountain_car
+from i2rl.domains.episodes import Perturbed, graded_mix, simulate
 from i2rl.domains.locomotion import locomotion
 from i2rl.models.networks import ActionSpace, policy_network
 
