@@ -5,7 +5,7 @@ BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 PEERS := .venv-peers
 
-.PHONY: run test lint notebooks bench bench-peers clean
+.PHONY: run test lint notebooks experts bench bench-peers clean
 
 run: $(READY)
 	$(BIN)/i2rl run patrol
@@ -22,6 +22,10 @@ lint: $(READY)
 # Executes the notebooks in place, at full size.
 notebooks: $(READY)
 	$(BIN)/python -m i2rl.analysis.notebooks.execute
+
+# Trains the experts of the continuous tasks anew, and records them in domains/recordings.
+experts: $(READY)
+	$(BIN)/python -m i2rl.domains.experts
 
 bench: $(READY)
 	$(BIN)/python -m i2rl.analysis.benchmarks.sessions
