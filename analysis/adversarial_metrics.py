@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy import stats
 
-from ..domains.episodes import Behaviour, acted, simulate
+from ..domains.simulation import Behaviour, acted, simulate
 from ..models.environment import Environment, HostEnvironment
 from ..models.networks import ActionSpace
 

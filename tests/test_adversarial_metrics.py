@@ -23,8 +23,8 @@ from i2rl.analysis.adversarial_metrics import (
     seed_interval,
 )
 from i2rl.domains.control import cart_pole, mountain_car
-from i2rl.domains.episodes import Perturbed, graded_mix, simulate
 from i2rl.domains.locomotion import locomotion
+from i2rl.domains.simulation import Perturbed, graded_mix, simulate
 from i2rl.models.networks import ActionSpace, policy_network
 
 KEY = jax.random.key(0)
