@@ -167,8 +167,9 @@ def load_demonstrations(name: str) -> Demonstrations:
 def load_expert(name: str) -> Policy:
     """The stored policy of an expert. Raises ``ValueError`` for a name that is not in :data:`EXPERTS`."""
     task, facts = expert_task(name), load_facts(name)
-    template = policy_network(
-        jax.random.key(0), task.observation_size, task.actions, facts["settings"]["hidden"]
+    template = jax.eval_shape(
+        lambda key: policy_network(key, task.observation_size, task.actions, facts["settings"]["hidden"]),
+        jax.random.key(0),
     )
     paths, structure = jax.tree_util.tree_flatten_with_path(template)
     with np.load(FOLDER / f"{name}-policy.npz", allow_pickle=False) as arrays:
