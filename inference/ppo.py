@@ -189,7 +189,7 @@ def advantages(
     or of the rollout. ``next_values`` are of the true successors; those of terminated steps do not count.
     """
     surprises = rewards + gamma * jnp.where(terminated, 0, next_values) - values
-    onwards = jnp.where(terminated | truncated, 0, gamma * gae_lambda).astype(DTYPE)
+    onwards = (1 - (terminated | truncated).astype(DTYPE)) * (gamma * gae_lambda)
 
     def back(later: Array, step: tuple[Array, Array]) -> tuple[Array, Array]:
         surprise, onward = step
@@ -242,24 +242,17 @@ def _init(environment: Task, settings: Settings, key: Array) -> PPOState:
 
 
 def _collect(environment: Task, settings: Settings, state: PPOState) -> tuple[PPOState, Rollout]:
-    if isinstance(environment, Environment):
-        return _collect_compiled(environment, settings, state)
+    roll = _roll_compiled if isinstance(environment, Environment) else _roll
+    return roll(environment, settings.n_steps, state)
+
+
+def _roll(environment: Task, length: int, state: PPOState) -> tuple[PPOState, Rollout]:
     key, k_roll = jax.random.split(state.key)
-    running, rollout = roll_out(
-        environment, state.policy, state.critic, state.running, k_roll, settings.n_steps
-    )
+    running, rollout = roll_out(environment, state.policy, state.critic, state.running, k_roll, length)
     return state._replace(running=running, key=key), rollout
 
 
-@partial(jax.jit, static_argnames=("environment", "settings"))
-def _collect_compiled(
-    environment: Environment, settings: Settings, state: PPOState
-) -> tuple[PPOState, Rollout]:
-    key, k_roll = jax.random.split(state.key)
-    running, rollout = roll_out(
-        environment, state.policy, state.critic, state.running, k_roll, settings.n_steps
-    )
-    return state._replace(running=running, key=key), rollout
+_roll_compiled = jax.jit(_roll, static_argnums=(0, 1))
 
 
 def _improve_with(settings: Settings, state: PPOState, rollout: Rollout, rewards: ArrayLike) -> PPOState:
