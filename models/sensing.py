@@ -202,14 +202,16 @@ class GaussianSensor(_GaussianFields):
         """Check and convert both."""
         # Only what a user would write is checked: JAX rebuilds this tuple around its own placeholders.
         return super().__new__(
-            cls, _covariance("state", state_covariance), _covariance("action", action_covariance)
+            cls,
+            checked_covariance("state", state_covariance),
+            checked_covariance("action", action_covariance),
         )
 
     def sized(self, observation_size: int, action_size: int) -> GaussianSensor:
         """The same with matrices ``[d, d]`` and ``[k, k]``; ``ValueError`` where the sizes differ."""
         return GaussianSensor(
-            _matrix("state", self.state_covariance, observation_size),
-            _matrix("action", self.action_covariance, action_size),
+            covariance_matrix("state", self.state_covariance, observation_size),
+            covariance_matrix("action", self.action_covariance, action_size),
         )
 
     def sample(
@@ -232,12 +234,16 @@ class GaussianSensor(_GaussianFields):
     ) -> Float[Array, "..."]:
         """Log-density of the reports, in nats."""
         sensor = self.sized(observations.shape[-1], actions.shape[-1])
-        return _log_normal(reported_observations - observations, sensor.state_covariance) + _log_normal(
+        return log_normal(reported_observations - observations, sensor.state_covariance) + log_normal(
             reported_actions - actions, sensor.action_covariance
         )
 
 
-def _covariance(whose: str, given: Any) -> Any:
+def checked_covariance(whose: str, given: Any) -> Any:
+    """A covariance as somebody wrote it (number, diagonal, matrix) as an array; JAX's arrays as they are.
+
+    Raises ``ValueError`` where it is not finite, not symmetric or not positive definite.
+    """
     if not isinstance(given, np.ndarray | np.generic | list | tuple | int | float):
         return given
     array = np.asarray(given, float)
@@ -260,10 +266,11 @@ def _covariance(whose: str, given: Any) -> Any:
     return jnp.asarray(array)
 
 
-def _matrix(whose: str, covariance: Array, size: int) -> Array:
+def covariance_matrix(whose: str, covariance: Array, size: int) -> Float[Array, "size size"]:
+    """The matrix that a number or a diagonal stands for; ``ValueError`` where its size is another."""
     if covariance.ndim and covariance.shape[-1] != size:
         raise ValueError(
-            f"the {whose} covariance has shape {covariance.shape}, but {whose}s have {size} components"
+            f"the {whose} covariance has shape {covariance.shape}, but there are {size} components"
         )
     return covariance if covariance.ndim == 2 else covariance * jnp.eye(size)
 
@@ -272,7 +279,8 @@ def _normal(key: Array, covariance: Float[Array, "d d"], shape: tuple[int, ...])
     return jax.random.normal(key, shape, covariance.dtype) @ jnp.linalg.cholesky(covariance).T
 
 
-def _log_normal(difference: Float[Array, "... d"], covariance: Float[Array, "d d"]) -> Float[Array, "..."]:
+def log_normal(difference: Float[Array, "... d"], covariance: Float[Array, "d d"]) -> Float[Array, "..."]:
+    """Log-density at a difference from the mean, in nats."""
     factor = jnp.linalg.cholesky(covariance)
     whiten = jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(factor)), lower=True)
     z = difference @ whiten.T

@@ -1,0 +1,305 @@
+"""Gibbs sweeps over the truth behind continuous recordings, corrected by Metropolis and Hastings.
+
+The dissertation's sampler (Eq. 6.10, Technique 2) as an exact one. A state given its Markov blanket, or an
+action, is proposed from a Gaussian in information form, the dynamics and the policy linearised about the
+present value, and accepted by the exact densities; the reverse proposal has its own linearisation. Given all
+odd steps the even ones are independent, and given the states so are the actions, so a sweep is three updates
+of everything at once. With affine dynamics and policy every proposal is accepted.
+
+Neighbours that follow each other closely (small ``Q``) move each other slowly: the smoother of
+:mod:`.gaussian_truth` is the default, and this its check.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.linalg import cho_solve, solve_triangular
+from jaxtyping import Array, Float
+
+from ..models.sensing import GaussianSensor, Recording, Truths, log_normal, truths
+from .gaussian_truth import GaussianTruth, JaxDynamics, Model, linear_policy, policy_moments
+
+
+class GibbsChain(NamedTuple):
+    """The reports, ``M`` draws of the truth, and how many proposals were accepted.
+
+    Fields
+    ------
+    reported : Recording
+    observations, actions : float ``[M, n, L, d]``, ``[M, n, L, k]``
+    accepted, proposed : float
+        Counted since ``init``.
+    """
+
+    reported: Recording
+    observations: Float[Array, "M n L d"]
+    actions: Float[Array, "M n L k"]
+    accepted: Float[Array, ""]
+    proposed: Float[Array, ""]
+
+
+class _Blanket(NamedTuple):
+    """What a state, or an action, depends on; leading axes ``N``.
+
+    ``first`` and ``followed`` say which terms there are: T1 of a first state is the Gaussian of ``s_0``, and
+    a last step has no T3.
+    """
+
+    expected: Array
+    following: Array
+    other: Array
+    report: Array
+    first: Array
+    followed: Array
+
+
+class _Tangent(NamedTuple):
+    """Value, next state, and the slope of the next state by the value."""
+
+    value: Array
+    following: Array
+    slope: Array
+
+
+def _law_of_start(model: Model, blanket: _Blanket) -> tuple[Array, Array]:
+    first = blanket.first[:, None]
+    return (
+        jnp.where(first, model.initial_mean, blanket.expected),
+        jnp.where(first[..., None], model.initial_covariance, model.process_covariance),
+    )
+
+
+def _inverse(covariance: Array) -> Array:
+    eye = jnp.broadcast_to(jnp.eye(covariance.shape[-1]), covariance.shape)
+    return cho_solve((jnp.linalg.cholesky(covariance), True), eye)
+
+
+def _pull_back(model: Model, blanket: _Blanket, at: _Tangent) -> tuple[Array, Array]:
+    """T3 as precision and information of the value."""
+    weight = _inverse(model.process_covariance)
+    slope = jnp.where(blanket.followed[:, None, None], at.slope, 0.0)
+    pulled = jnp.einsum("nji,jk->nik", slope, weight)
+    target = blanket.following - at.following + jnp.einsum("nij,nj->ni", slope, at.value)
+    return pulled @ slope, jnp.einsum("nij,nj->ni", pulled, target)
+
+
+def _state_law(
+    model: Model, policy: Any, sensor: GaussianSensor, blanket: _Blanket, at: _Tangent
+) -> tuple[Array, Array]:
+    """Precision and information of a state: T1, T3, T4 and, through the slope of the policy, T2."""
+    mean, covariance = _law_of_start(model, blanket)
+    prior, read = _inverse(covariance), _inverse(sensor.state_covariance)
+    mu, K, sigma = linear_policy(policy, at.value)
+    through = K.swapaxes(-1, -2) @ _inverse(sigma)
+    target = blanket.other - mu + jnp.einsum("nij,nj->ni", K, at.value)
+    precision, information = _pull_back(model, blanket, at)
+    precision += prior + read + through @ K
+    information += jnp.einsum("nij,nj->ni", prior, mean) + blanket.report @ read
+    return precision, information + jnp.einsum("nij,nj->ni", through, target)
+
+
+def _action_law(
+    model: Model, policy: Any, sensor: GaussianSensor, blanket: _Blanket, at: _Tangent
+) -> tuple[Array, Array]:
+    """Precision and information of an action: T2, T3 and T5."""
+    mu, sigma = policy_moments(policy, blanket.other)
+    prior, read = _inverse(sigma), _inverse(sensor.action_covariance)
+    precision, information = _pull_back(model, blanket, at)
+    precision += prior + read
+    return precision, information + jnp.einsum("nij,nj->ni", prior, mu) + blanket.report @ read
+
+
+def _log_step(model: Model, blanket: _Blanket, at: _Tangent) -> Array:
+    step = log_normal(blanket.following - at.following, model.process_covariance)
+    return jnp.where(blanket.followed, step, 0.0)
+
+
+def _log_state(
+    model: Model, policy: Any, sensor: GaussianSensor, blanket: _Blanket, at: _Tangent
+) -> Float[Array, " N"]:
+    start = log_normal(at.value - model.initial_mean, model.initial_covariance)
+    move = log_normal(at.value - blanket.expected, model.process_covariance)
+    report = log_normal(blanket.report - at.value, sensor.state_covariance)
+    act = policy.log_prob(at.value, blanket.other).astype(float)
+    return jnp.where(blanket.first, start, move) + _log_step(model, blanket, at) + report + act
+
+
+def _log_action(
+    model: Model, policy: Any, sensor: GaussianSensor, blanket: _Blanket, at: _Tangent
+) -> Float[Array, " N"]:
+    report = log_normal(blanket.report - at.value, sensor.action_covariance)
+    act = policy.log_prob(blanket.other, at.value).astype(float)
+    return _log_step(model, blanket, at) + report + act
+
+
+_LAWS = {"states": (_state_law, _log_state), "actions": (_action_law, _log_action)}
+
+
+def _log_proposal(value: Array, precision: Array, information: Array) -> Array:
+    factor = jnp.linalg.cholesky(precision)
+    mean = cho_solve((factor, True), information[..., None])[..., 0]
+    z = jnp.einsum("nji,nj->ni", factor, value - mean)
+    return jnp.sum(jnp.log(jnp.diagonal(factor, axis1=-2, axis2=-1)), -1) - 0.5 * jnp.sum(z**2, -1)
+
+
+@partial(jax.jit, static_argnums=0)
+def _proposed(
+    which: str,
+    key: Array,
+    model: Model,
+    policy: Any,
+    sensor: GaussianSensor,
+    blanket: _Blanket,
+    at: _Tangent,
+) -> Array:
+    precision, information = _LAWS[which][0](model, policy, sensor, blanket, at)
+    factor = jnp.linalg.cholesky(precision)
+    mean = cho_solve((factor, True), information[..., None])
+    z = jax.random.normal(key, mean.shape, mean.dtype)
+    return (mean + solve_triangular(factor, z, trans=1, lower=True))[..., 0]
+
+
+@partial(jax.jit, static_argnums=0)
+def _log_acceptance(
+    which: str,
+    model: Model,
+    policy: Any,
+    sensor: GaussianSensor,
+    blanket: _Blanket,
+    at: _Tangent,
+    to: _Tangent,
+) -> Float[Array, " N"]:
+    law, log_density = _LAWS[which]
+    there = _log_proposal(to.value, *law(model, policy, sensor, blanket, at))
+    back = _log_proposal(at.value, *law(model, policy, sensor, blanket, to))
+    gain = log_density(model, policy, sensor, blanket, to) - log_density(model, policy, sensor, blanket, at)
+    return gain + back - there
+
+
+class GaussianGibbs(NamedTuple):
+    """``init(recording, key) -> chain`` and ``refresh(chain, policy, key, sensor) -> (chain, truths)``.
+
+    Fields
+    ------
+    truth : GaussianTruth
+        Dynamics, ``Q``, the law of ``s_0``, the number of draws (chains, ``M``) and the widths; the last of
+        the widths is used throughout.
+    sweeps : int
+        Of a refresh, after which the draws are the chains as they are.
+    """
+
+    truth: GaussianTruth
+    sweeps: int = 10
+
+    def init(self, reported: Recording) -> GibbsChain:
+        """Every chain starts at the reports."""
+        start = self.truth.init(reported).point
+        shape = (self.truth.draws, 1, 1, 1)
+        return GibbsChain(
+            reported,
+            jnp.tile(start.observations, shape),
+            jnp.tile(start.actions, shape),
+            jnp.zeros(()),
+            jnp.zeros(()),
+        )
+
+    def refresh(
+        self, chain: GibbsChain, policy: Any, key: Array, sensor: GaussianSensor
+    ) -> tuple[GibbsChain, Truths]:
+        """``sweeps`` sweeps: even states, odd states, actions."""
+        t = self.truth
+        sensor = sensor.sized(chain.observations.shape[-1], chain.actions.shape[-1])
+        sweep = _compiled_sweep if isinstance(t.dynamics, JaxDynamics) else _sweep
+        for key_sweep in jax.random.split(key, self.sweeps):
+            chain = sweep(t.dynamics, t.widths[-1:], t.model, policy, sensor, chain, key_sweep)
+        return chain, truths(chain.reported, chain.observations, chain.actions)
+
+
+def _sweep(
+    dynamics: Any,
+    width: tuple[float, ...],
+    model: Model,
+    policy: Any,
+    sensor: GaussianSensor,
+    chain: GibbsChain,
+    key: Array,
+) -> GibbsChain:
+    length = chain.observations.shape[2]
+    updates = (("states", 0, 2), ("states", 1, 2), ("actions", 0, 1))
+    for (which, first, stride), k in zip(updates, jax.random.split(key, 3), strict=True):
+        steps = np.arange(first, length, stride)
+        chain = _update(which, steps, dynamics, width, model, policy, sensor, chain, k)
+    return chain
+
+
+# A simulator is no part of a compiled function.
+_compiled_sweep = jax.jit(_sweep, static_argnums=(0, 1))
+
+
+def _update(
+    which: str,
+    steps: np.ndarray,
+    dynamics: Any,
+    width: tuple[float, ...],
+    model: Model,
+    policy: Any,
+    sensor: GaussianSensor,
+    chain: GibbsChain,
+    key: Array,
+) -> GibbsChain:
+    key_move, key_accept = jax.random.split(key)
+    s, a, reported = chain.observations, chain.actions, chain.reported
+    before, after = np.maximum(steps - 1, 0), np.minimum(steps + 1, s.shape[2] - 1)
+    draws = s.shape[0]
+
+    def rows(x: Array) -> Array:
+        return x.reshape(-1, *x.shape[3:])
+
+    def tiled(x: Array) -> Array:
+        return rows(jnp.broadcast_to(x, (draws, *x.shape)))
+
+    moving, other = (s, a) if which == "states" else (a, s)
+    report = reported.observations if which == "states" else reported.actions
+    here = rows(s[:, :, steps])
+    blanket = _Blanket(
+        expected=_next(dynamics, rows(s[:, :, before]), rows(a[:, :, before])) if which == "states" else here,
+        following=rows(s[:, :, after]),
+        other=rows(other[:, :, steps]),
+        report=tiled(report[:, steps]),
+        first=tiled(jnp.broadcast_to(steps == 0, (s.shape[1], len(steps)))),
+        followed=tiled(reported.followed[:, steps]),
+    )
+    value = rows(moving[:, :, steps])
+    at = _tangent(which, dynamics, width, value, blanket.other)
+    candidate = _proposed(which, key_move, model, policy, sensor, blanket, at)
+    to = _tangent(which, dynamics, width, candidate, blanket.other)
+    log_ratio = _log_acceptance(which, model, policy, sensor, blanket, at, to)
+    live = tiled(reported.live[:, steps])
+    accept = live & (jnp.log(jax.random.uniform(key_accept, log_ratio.shape)) < log_ratio)
+    new = jnp.where(accept[:, None], candidate, value).reshape(moving[:, :, steps].shape)
+    moved = moving.at[:, :, steps].set(new)
+    return chain._replace(
+        observations=moved if which == "states" else s,
+        actions=a if which == "states" else moved,
+        accepted=chain.accepted + jnp.sum(accept),
+        proposed=chain.proposed + jnp.sum(live),
+    )
+
+
+def _native(dynamics: Any, s: Array, a: Array) -> tuple[Any, Any]:
+    return (s, a) if isinstance(dynamics, JaxDynamics) else (np.asarray(s), np.asarray(a))
+
+
+def _next(dynamics: Any, s: Array, a: Array) -> Array:
+    return jnp.asarray(dynamics.next_state(*_native(dynamics, s, a)))
+
+
+def _tangent(which: str, dynamics: Any, width: tuple[float, ...], value: Array, other: Array) -> _Tangent:
+    s, a = _native(dynamics, *((value, other) if which == "states" else (other, value)))
+    slopes = dynamics.jacobians(s, a, *(() if isinstance(dynamics, JaxDynamics) else width))
+    return _Tangent(value, _next(dynamics, s, a), jnp.asarray(slopes[0 if which == "states" else 1]))

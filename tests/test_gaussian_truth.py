@@ -1,0 +1,342 @@
+"""The truth behind continuous recordings: the smoother and the Gibbs sampler against exact answers."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from i2rl.inference.gaussian_gibbs import GaussianGibbs
+from i2rl.inference.gaussian_truth import fitted_sensor, gaussian_truth, jax_dynamics, log_joint
+from i2rl.inference.serialization import decode, encode, restore
+from i2rl.models.networks import ActionSpace, GaussianPolicy
+from i2rl.models.sensing import GaussianSensor, distort, log_normal, recording
+
+KEY = jax.random.key(0)
+d, k = 2, 1
+A = np.array([[0.9, 0.2], [-0.3, 0.8]])
+B = np.array([[0.1], [0.5]])
+C = np.array([0.05, -0.1])
+Q = np.array([[0.02, 0.005], [0.005, 0.03]])
+
+
+class AffinePolicy(NamedTuple):
+    """Actions normal about an affine function of the state, in 64 bits."""
+
+    slope: jax.Array
+    intercept: jax.Array
+    covariance: jax.Array
+
+    def moments(self, s):
+        return s @ self.slope.T + self.intercept, jnp.broadcast_to(self.covariance, (*s.shape[:-1], k, k))
+
+    def log_prob(self, s, a):
+        return log_normal(a - self.moments(s)[0], self.covariance)
+
+
+POLICY = AffinePolicy(jnp.array([[-0.5, 0.4]]), jnp.array([0.1]), jnp.array([[0.2]]))
+SENSOR = GaussianSensor([[0.3, 0.1], [0.1, 0.2]], 0.1)
+
+
+def affine(s, a):
+    return jnp.asarray(A) @ s + jnp.asarray(B) @ a + jnp.asarray(C)
+
+
+def pendulum(s, a):
+    """A damped pendulum with a torque, in steps of 0.2 seconds."""
+    turning = 0.95 * s[1] - 1.2 * jnp.sin(s[0]) + 0.6 * jnp.tanh(a[0])
+    return jnp.stack([s[0] + 0.2 * turning, turning])
+
+
+AFFINE, PENDULUM = jax_dynamics(affine), jax_dynamics(pendulum)
+
+
+def simulated(f, lengths, policy, noise, seed=0):
+    """Trajectories of the model itself."""
+    rng = np.random.default_rng(seed)
+    n = len(lengths)
+    s, pairs = jnp.asarray(rng.normal(size=(n, d))), []
+    for _ in range(max(lengths)):
+        mean, covariance = policy.moments(s)
+        a = mean + rng.normal(size=(n, k)) @ np.linalg.cholesky(covariance[0]).T
+        pairs.append((s, a))
+        s = f.next_state(s, a) + rng.normal(size=(n, d)) @ np.linalg.cholesky(noise).T
+    observations, actions = (np.stack(x, 1) for x in zip(*pairs, strict=True))
+    return recording(
+        [o[:length] for o, length in zip(observations, lengths, strict=True)],
+        [a[:length] for a, length in zip(actions, lengths, strict=True)],
+    )
+
+
+def affine_problem(lengths=(4, 6)):
+    return distort(KEY, SENSOR, simulated(AFFINE, lengths, POLICY, Q))
+
+
+def least_squares(reported, i, sensor=SENSOR, prior=1.0):
+    """Posterior of one trajectory as one weighted least-squares problem in all its pairs; and its evidence.
+
+    Rows ``J x - b`` with their covariance, one a factor of the model: nothing is eliminated or reordered.
+    """
+    length, D = int(reported.lengths[i]), d + k
+    o, b_a = np.asarray(reported.observations[i]), np.asarray(reported.actions[i])
+    sensor = sensor.sized(d, k)
+    rows, before = [], None
+    for t in range(length):
+        here = np.zeros((D, length * D))
+        here[:, t * D : (t + 1) * D] = np.eye(D)
+        s, a = here[:d], here[d:]
+        if before is None:
+            rows.append((s, np.zeros(d), prior * np.eye(d)))
+        else:
+            rows.append((s - A @ before[:d] - B @ before[d:], C, Q))
+        rows.append((a - np.asarray(POLICY.slope) @ s, np.asarray(POLICY.intercept), POLICY.covariance))
+        rows.append((s, o[t], sensor.state_covariance))
+        rows.append((a, b_a[t], sensor.action_covariance))
+        before = here
+    J, b = np.concatenate([r[0] for r in rows]), np.concatenate([r[1] for r in rows])
+    W = np.zeros((len(b), len(b)))
+    at = 0
+    for _, r, covariance in rows:
+        W[at : at + len(r), at : at + len(r)] = np.linalg.inv(covariance)
+        at += len(r)
+    precision = J.T @ W @ J
+    covariance = np.linalg.inv(precision)
+    mean = covariance @ J.T @ W @ b
+    residual = b - J @ mean
+    log_peak = (
+        0.5 * np.linalg.slogdet(W)[1] - 0.5 * residual @ W @ residual - 0.5 * len(b) * np.log(2 * np.pi)
+    )
+    evidence = log_peak + 0.5 * (np.linalg.slogdet(covariance)[1] + len(mean) * np.log(2 * np.pi))
+    return mean.reshape(length, D), covariance.reshape(length, D, length, D), evidence
+
+
+def affine_truth(**options):
+    return gaussian_truth(AFFINE, d, process_covariance=Q, initial_covariance=1.0, **options)
+
+
+def test_the_smoother_is_exact_on_affine_problems():
+    reported = affine_problem()
+    truth = affine_truth(iterations=1)
+    chain, _ = truth.refresh(truth.init(reported), POLICY, KEY, SENSOR)
+    posterior = truth.posterior(chain, POLICY, SENSOR)
+    for i, length in enumerate(reported.lengths):
+        mean, covariance, evidence = least_squares(reported, i)
+        np.testing.assert_allclose(posterior.means[i, :length], mean, atol=1e-8)
+        np.testing.assert_allclose(chain.point.observations[i, :length], mean[:, :d], atol=1e-8)
+        np.testing.assert_allclose(posterior.log_likelihood[i], evidence, atol=1e-8)
+        for t in range(length):
+            np.testing.assert_allclose(posterior.covariances[i, t], covariance[t, :, t], atol=1e-8)
+            if t:
+                np.testing.assert_allclose(posterior.lagged[i, t - 1], covariance[t, :, t - 1], atol=1e-8)
+
+
+def test_draws_have_the_posterior_and_their_own_successors():
+    reported = affine_problem()
+    truth = affine_truth(draws=4000)
+    _, drawn = truth.refresh(truth.init(reported), POLICY, KEY, SENSOR)
+    pairs = np.asarray(jnp.concatenate([drawn.observations, drawn.actions], -1))
+    for i, length in enumerate(reported.lengths):
+        mean, covariance, _ = least_squares(reported, i)
+        spread = np.sqrt(np.einsum("titi->ti", covariance))
+        assert (abs(pairs[:, i, :length].mean(0) - mean) < 5 * spread / np.sqrt(4000)).all()
+        np.testing.assert_array_equal(
+            drawn.successors[:, i, : length - 1], drawn.observations[:, i, 1:length]
+        )
+        assert np.asarray(drawn.usable[0, i]).sum() == length - 1
+
+
+def test_gibbs_accepts_everything_and_agrees_with_the_closed_form_on_affine_problems():
+    reported = affine_problem()
+    gibbs = GaussianGibbs(affine_truth(draws=200), sweeps=1)
+    chain = gibbs.init(reported)
+    kept = []
+    for i, key in enumerate(jax.random.split(KEY, 160)):
+        chain, _ = gibbs.refresh(chain, POLICY, key, SENSOR)
+        if i >= 40:
+            kept.append(np.asarray(jnp.concatenate([chain.observations, chain.actions], -1)))
+    assert chain.accepted == chain.proposed > 0
+    x = np.stack(kept)  # [sweeps, chains, n, L, D]
+    for i, length in enumerate(reported.lengths):
+        mean, covariance, _ = least_squares(reported, i)
+        of_chains = x[:, :, i, :length].mean(
+            0
+        )  # chains are independent: their spread is the error of the mean
+        error = of_chains.std(0, ddof=1) / np.sqrt(x.shape[1])
+        assert (abs(of_chains.mean(0) - mean) < 5 * error).all()
+        squares = ((x[:, :, i, :length] - mean) ** 2).mean(0)
+        error = squares.std(0, ddof=1) / np.sqrt(x.shape[1])
+        assert (abs(squares.mean(0) - np.einsum("titi->ti", covariance)) < 5 * error).all()
+
+
+def pendulum_problem(lengths, sensor, seed=0):
+    policy = AffinePolicy(jnp.array([[-0.3, 0.5]]), jnp.array([0.2]), jnp.array([[0.3]]))
+    truth = simulated(PENDULUM, lengths, policy, 1e-2 * np.eye(d), seed)
+    return policy, truth, distort(jax.random.fold_in(KEY, seed), sensor, truth)
+
+
+def test_smoother_gibbs_and_importance_sampling_agree_on_a_pendulum():
+    sensor = GaussianSensor(0.04, 0.05)
+    policy, _, reported = pendulum_problem((6, 4), sensor)
+    n = 20_000
+    truth = gaussian_truth(PENDULUM, d, process_covariance=1e-2, initial_covariance=1.0, draws=n)
+    chain, drawn = truth.refresh(truth.init(reported), policy, KEY, sensor)
+    posterior = truth.posterior(chain, policy, sensor)
+    gibbs = GaussianGibbs(truth._replace(draws=250), sweeps=1)
+    walk, total = gibbs.init(reported), 0
+    for i, key in enumerate(jax.random.split(KEY, 180)):
+        walk, _ = gibbs.refresh(walk, policy, key, sensor)
+        if i >= 60:
+            total += np.asarray(jnp.concatenate([walk.observations, walk.actions], -1)) / 120
+    assert 0.8 < walk.accepted / walk.proposed < 1
+
+    following = PENDULUM.next_state(drawn.observations.reshape(-1, d), drawn.actions.reshape(-1, k))
+    log_p = log_joint(
+        truth.model,
+        policy,
+        sensor.sized(d, k),
+        reported,
+        drawn.observations,
+        drawn.actions,
+        following.reshape(drawn.observations.shape),
+    )
+    pairs = np.asarray(jnp.concatenate([drawn.observations, drawn.actions], -1))
+    for i, length in enumerate(reported.lengths):
+        # The draws' own density, up to a constant, from their empirical moments.
+        flat = pairs[:, i, :length].reshape(n, -1)
+        centred = flat - flat.mean(0)
+        log_w = log_p[:, i] + 0.5 * np.sum(centred * np.linalg.solve(np.cov(flat.T), centred.T).T, 1)
+        w = np.exp(log_w - log_w.max())
+        w /= w.sum()
+        effective = 1 / np.sum(w**2)
+        assert effective > 2000
+        reference = (w @ flat).reshape(length, d + k)
+        spread = np.sqrt(np.asarray(jnp.diagonal(posterior.covariances[i, :length], axis1=1, axis2=2)))
+        assert (abs(posterior.means[i, :length] - reference) < 0.15 * spread).all()
+        of_chains = total[:, i, :length]
+        error = np.sqrt(of_chains.var(0, ddof=1) / 250 + spread**2 / effective)
+        assert (abs(of_chains.mean(0) - reference) < 5 * error).all()
+
+
+def test_smoothing_brings_a_pendulum_nearer_to_the_truth_and_never_lowers_the_density():
+    sensor = GaussianSensor(0.1, 0.05)
+    policy, true, reported = pendulum_problem([30] * 19 + [12], sensor)
+    truth = gaussian_truth(PENDULUM, d, process_covariance=1e-2, iterations=1)
+    chain = truth.init(reported)
+    densities = [np.asarray(truth.log_joint(chain, policy, sensor))]
+    for key in jax.random.split(KEY, 4):
+        chain, _ = truth.refresh(chain, policy, key, sensor)
+        densities.append(np.asarray(truth.log_joint(chain, policy, sensor)))
+    assert (np.diff(densities, axis=0) >= 0).all()
+
+    def error(x):
+        return float(jnp.sqrt(jnp.mean((x - true.observations)[true.live] ** 2)))
+
+    assert error(chain.point.observations) < 0.5 * error(reported.observations)
+
+
+class Simulator:
+    """The pendulum as a program that is no function of JAX's, with slopes from differences."""
+
+    def __init__(self):
+        self.steps = 0
+
+    def next_state(self, s, a):
+        self.steps += len(s)
+        turning = 0.95 * s[:, 1] - 1.2 * np.sin(s[:, 0]) + 0.6 * np.tanh(a[:, 0])
+        return np.stack([s[:, 0] + 0.2 * turning, turning], 1)
+
+    def jacobians(self, s, a, width=1e-6):
+        def slope(x, y, move):
+            def at(sign, i):
+                e = np.zeros(x.shape[1])
+                e[i] = sign * width
+                return self.next_state(x + e, y) if move else self.next_state(y, x + e)
+
+            return np.stack([(at(1, i) - at(-1, i)) / (2 * width) for i in range(x.shape[1])], 2)
+
+        return slope(s, a, True), slope(a, s, False)
+
+
+def test_a_simulator_serves_as_well_as_a_function_and_is_not_asked_about_padding():
+    sensor = GaussianSensor(0.1, 0.05)
+    policy, _, reported = pendulum_problem((6, 4), sensor)
+    simulator = Simulator()
+    results = []
+    for dynamics, widths in ((PENDULUM, ()), (simulator, (1e-6,))):
+        truth = gaussian_truth(dynamics, d, process_covariance=1e-2, iterations=3, widths=widths)
+        chain, drawn = truth.refresh(truth.init(reported), policy, KEY, sensor)
+        results.append((chain.point.observations, drawn.observations))
+    for one, other in zip(*results, strict=True):
+        np.testing.assert_allclose(one, other, atol=1e-6)
+    # One linearisation is 2 (d + k) steps a pair, a trial of the four step lengths four.
+    pairs = 5 + 3
+    assert simulator.steps == pairs * (4 * 2 * (d + k) + 1 + 4 * 4)
+
+
+def test_the_em_algorithm_never_lowers_the_likelihood_and_finds_the_covariances():
+    true = simulated(AFFINE, [30] * 20, POLICY, Q, seed=3)
+    reported = distort(KEY, SENSOR, true)
+    truth = affine_truth(iterations=1, draws=1)
+    sensor = GaussianSensor(1.0, 1.0).sized(d, k)
+    chain, _ = truth.refresh(truth.init(reported), POLICY, KEY, sensor)
+    values = []
+    for _ in range(25):
+        posterior = truth.posterior(chain, POLICY, sensor)
+        values.append(float(jnp.sum(posterior.log_likelihood)))
+        sensor = fitted_sensor(reported, posterior, True)
+    assert (np.diff(values) > -1e-8).all()
+    expected = SENSOR.sized(d, k)
+    np.testing.assert_allclose(jnp.diagonal(sensor.state_covariance), [0.3, 0.2], rtol=0.2)
+    np.testing.assert_allclose(sensor.state_covariance[0, 1], expected.state_covariance[0, 1], atol=0.04)
+    np.testing.assert_allclose(sensor.action_covariance, 0.1, rtol=0.2)
+
+
+def test_the_em_algorithm_finds_the_covariances_of_a_pendulums_sensor():
+    sensor = GaussianSensor(0.1, 0.1)
+    policy, _, reported = pendulum_problem([30] * 20, sensor)
+    truth = gaussian_truth(PENDULUM, d, process_covariance=1e-2, iterations=1, draws=1)
+    learned = GaussianSensor(0.3, 0.3).sized(d, k)
+    chain = truth.init(reported)
+    for key in jax.random.split(KEY, 25):
+        chain, _ = truth.refresh(chain, policy, key, learned)
+        learned = fitted_sensor(reported, truth.posterior(chain, policy, learned))
+    np.testing.assert_allclose(jnp.diagonal(learned.state_covariance), 0.1, rtol=0.2)
+    np.testing.assert_allclose(learned.action_covariance, 0.1, rtol=0.2)
+
+
+def test_a_chain_survives_its_storage_and_resampling_draws_the_same_from_it():
+    reported = affine_problem()
+    truth = affine_truth()
+    chain, drawn = truth.refresh(truth.init(reported), POLICY, KEY, SENSOR)
+    stored = restore(decode(encode(chain)), chain)
+    for one, other in zip(drawn, truth.resample(stored, POLICY, KEY, SENSOR), strict=True):
+        np.testing.assert_array_equal(one, other)
+
+
+def test_a_network_is_a_policy():
+    policy = GaussianPolicy.create(KEY, d, ActionSpace(0, (-1.0,), (1.0,)))
+    truth = affine_truth()
+    _, drawn = truth.refresh(truth.init(affine_problem()), policy, KEY, SENSOR)
+    assert np.isfinite(np.asarray(drawn.observations)).all()
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"process_covariance": -1.0}, "process covariance is not positive definite"),
+        ({"process_covariance": [1.0, 1.0, 1.0]}, "process covariance .* 2 components"),
+        ({"initial_mean": [0.0]}, "initial_mean"),
+        ({"draws": 0}, "at least 1"),
+    ],
+)
+def test_what_is_wrong_with_a_model_is_said(options, message):
+    with pytest.raises(ValueError, match=message):
+        gaussian_truth(AFFINE, d, **options)
+
+
+def test_recordings_of_another_size_are_refused():
+    with pytest.raises(ValueError, match=r"expected observations \[n, L, 3\]"):
+        gaussian_truth(AFFINE, 3).init(affine_problem())
