@@ -163,7 +163,9 @@ class Locomotion(NamedTuple):
     ) -> Float[np.ndarray, "n d"]:
         """The next observation, were the observation the state; no noise.
 
-        Exact but where a velocity of Hopper or Walker2d was cut at ±10. Raises as :meth:`step` does.
+        Exact but where a velocity of Hopper or Walker2d was cut at ±10, which is so in every twelfth step of
+        the stored Hopper and in half of the stored Walker2d. The worst next velocity is then off by 0.06 and
+        by 0.6 rad/s (medians), and now and then by several. Raises as :meth:`step` does.
         """
         return self.observe(_simulator(self.name, self.threads).advance(*self._taken(observations, actions)))
 
