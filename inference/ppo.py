@@ -126,10 +126,12 @@ class Training(NamedTuple):
     ------
     steps : int ``[U]``, environment steps so far
     returns : float ``[U]``, mean return of the episodes that ended in it; NaN where none did
+    episodes : int ``[U]``, how many did
     """
 
     steps: Int[np.ndarray, " U"]
     returns: Float[np.ndarray, " U"]
+    episodes: Int[np.ndarray, " U"]
 
 
 class PPO(NamedTuple):
@@ -328,17 +330,16 @@ def _descend(settings: Settings, state: PPOState, sample: Sample, key: Array) ->
 
 
 def _train(environment: Task, settings: Settings, state: PPOState, steps: int) -> tuple[PPOState, Training]:
-    returns = []
+    ended = []
     for _ in range(math.ceil(steps / settings.steps)):
         before = state.running
         state, rollout = _collect(environment, settings, state)
         state = _improve_with(settings, state, rollout, rollout.rewards)
-        ended = finished_returns(before, rollout)
-        returns.append(ended.mean() if len(ended) else np.nan)
-    first = int(state.updates) - len(returns)
-    return state, Training(
-        (first + 1 + np.arange(len(returns))) * settings.steps, np.array(returns, np.float64)
-    )
+        ended.append(finished_returns(before, rollout))
+    rounds = int(state.updates) - len(ended) + 1 + np.arange(len(ended))
+    means = [returns.mean() if len(returns) else np.nan for returns in ended]
+    counts = [len(returns) for returns in ended]
+    return state, Training(rounds * settings.steps, np.array(means, float), np.array(counts, int))
 
 
 # -- parts of these -----------------------------------------------------------------------------------

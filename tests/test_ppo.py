@@ -369,6 +369,8 @@ def test_learns_to_balance():
     state, training = agent.train(agent.init(jax.random.key(0)), 25_000)
     assert training.steps[-1] == 25 * 1024
     assert training.returns[0] < 50
+    total = np.nansum(training.returns * training.episodes) + np.sum(state.running.returns)
+    np.testing.assert_allclose(total, training.steps[-1], rtol=1e-5)  # one point a step
     assert agent.evaluate(state.policy, jax.random.key(1), 20).returns.mean() >= 475
 
 
