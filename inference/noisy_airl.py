@@ -1,9 +1,9 @@
 """Noisy-AIRL: AIRL that also sees what becomes of its policy when actions are random (Chen et al. 2020).
 
-The first step of the baseline of section 7.4.3, :mod:`.ssrr`. The generator acts side by side in environments
-that put random actions in place of its own, each with a probability of its own, so that the discriminator
-meets worse behaviour than the generator's and learns a reward that holds beyond what the expert visits. That
-the generated actions do not all come from the policy is made up for by importance weights.
+The first step of robust-AIRL's baseline, :mod:`.ssrr` (section 7.3). The generator acts side by side in
+environments that put random actions in place of its own, each with a probability of its own, so that the
+discriminator meets worse behaviour than the generator's and learns a reward that holds beyond what the expert
+visits. That the generated actions do not all come from the policy is made up for by importance weights.
 
 Each step has two actions: the one *intended*, drawn from the policy, and the one *executed*. A rollout holds
 the intended ones, so its log-probabilities are those of the policy and PPO improves on-policy. The
@@ -126,7 +126,7 @@ def roll_out_noisily(
     policy: Policy,
     critic: MLP,
     running: Running,
-    levels: Float[Array, " n"],
+    levels: ArrayLike,
     key: Array,
     length: int,
 ) -> tuple[Running, NoisyRollout]:
@@ -229,6 +229,13 @@ def weighted_cross_entropy(
     return 0.5 * loss, Losses(0.5 * loss, jnp.mean(of_expert > 0), jnp.mean(of_generated < 0))
 
 
+@jax.jit
+def action_log_likelihood(policy: Policy, expert: ExpertTransitions) -> Float[Array, ""]:
+    """Mean log-likelihood of the expert's reported actions, nats a step."""
+    each = policy.log_prob(expert.steps.observations, expert.steps.actions) @ expert.weights
+    return jnp.sum(jnp.where(expert.live, each, 0)) / jnp.sum(expert.live)
+
+
 # -- the learner ------------------------------------------------------------------------------------------
 
 
@@ -299,11 +306,6 @@ def noisy_airl(
     def rewarded(network: ShapedReward, policy: Policy, noisy: NoisyRollout) -> Float[Array, "T n"]:
         return discriminator.rewards(network, policy, noisy.steps("intended", task.actions))
 
-    @jax.jit
-    def likelihood(policy: Policy, expert: ExpertTransitions) -> Float[Array, ""]:
-        each = policy.log_prob(expert.steps.observations, expert.steps.actions)[:, 0]
-        return jnp.sum(jnp.where(expert.live, each, 0)) / jnp.sum(expert.live)
-
     def init(key: Array) -> AdversarialState:
         k_network, k_agent, key = jax.random.split(key, 3)
         network = discriminator.init(k_network)
@@ -354,7 +356,7 @@ def noisy_airl(
         met: Losses = jax.tree.map(lambda *x: np.asarray(x, np.float64), *losses)
         report = AdversarialReport(
             session=int(state.session),
-            log_likelihood=float(likelihood(acting.policy, expert)),
+            log_likelihood=float(action_log_likelihood(acting.policy, expert)),
             **met._asdict(),
             returns=np.asarray(returns, np.float64),
             pairs=int(state.pairs),
@@ -425,6 +427,7 @@ def _discriminator_updates(
             return (optax.apply_updates(parameters, change), memory), met
 
         keys = jax.random.split(k_updates, how.updates)
+        each: Losses
         (parameters, memory), each = lax.scan(step, (_trainable(network), memory), keys)
         return _with(network, parameters), memory, Losses(*(x[-1] for x in each))
 

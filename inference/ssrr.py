@@ -1,36 +1,35 @@
 """SSRR: rewards regressed on how performance falls as actions grow noisy (Chen, Paleja and Gombolay 2020).
 
-The baseline of section 7.4.3. Four steps: noisy-AIRL learns a policy and a first reward from what the expert
-showed; that policy, acted out at twenty levels of noise, shows how the reward it earns falls with the noise
-(:func:`fit_noise_curve`); networks are then regressed on what that curve says each snippet of those
-trajectories is worth (:func:`snippet_regression`); and a second policy is learned from their mean. No
+The baseline of robust-AIRL (section 7.3). Four steps: noisy-AIRL learns a policy and a first reward from what
+the expert showed; that policy, acted out at twenty levels of noise, shows how the reward it earns falls with
+the noise (:func:`fit_noise_curve`); networks are then regressed on what that curve says each snippet of those
+trajectories is worth (:mod:`.snippet_regression`); and a second policy is learned from their mean. No
 demonstration beyond the first step is used, so what is learned can be better than what was shown, and can be
-far from what the expert was after (section 2.6).
+far from what the expert was after (section 2.3.3).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+import time
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import isotonic_regression, least_squares
 
-from ..models.extras import required
-from ..models.networks import DTYPE, MLP, RunningNorm
-
-if TYPE_CHECKING:
-    import equinox as eqx
-    import optax
-else:
-    eqx, optax = required("equinox"), required("optax")
-
-WORTH = 10.0
-"""What a whole trajectory without noise is worth to the regression, as released."""
+from ..models.environment import Environment, HostEnvironment, Rollout
+from ..models.networks import DTYPE, ShapedReward
+from ..models.sensing import Recording
+from .airl import AdversarialReport, AdversarialState, reported_steps
+from .discriminator import Discriminator
+from .noisy_airl import NoisyRollout, NoisyTraining, action_log_likelihood, noisy_airl, roll_out_noisily
+from .ppo import PPO, PPOState
+from .rollouts import begin, finished_returns
+from .session import Learner
+from .snippet_regression import Ranked, Regression, SSRRReward, snippet_regression
 
 # -- performance against noise ----------------------------------------------------------------------------
 
@@ -135,260 +134,212 @@ def fit_noise_curve(
     )
 
 
-# -- regression on snippets -------------------------------------------------------------------------------
+def rank(
+    environment: Environment | HostEnvironment,
+    acting: PPOState,
+    network: ShapedReward,
+    levels: Float[np.ndarray, " E"],
+    trajectories: int,
+    key: Array,
+) -> tuple[NoiseCurve, Ranked]:
+    """Act out a policy with noise, and say from the noise alone what each trajectory is worth.
+
+    ``trajectories`` whole episodes at each level are scored by the sum of the state rewards ``network``, the
+    reward of the absorbing state counting for what is left of those that terminated.
+    """
+    k_start, k_roll = jax.random.split(key)
+    each = np.repeat(levels, trajectories)
+    _, noisy = roll_out_noisily(
+        environment,
+        acting.policy,
+        acting.critic,
+        begin(environment, k_start, len(each)),
+        each,
+        k_roll,
+        environment.horizon,
+    )
+    scores, lengths = _scored(network, noisy)
+    curve = fit_noise_curve(levels, np.asarray(scores, float).reshape(-1, trajectories).mean(1))
+    observations = jnp.swapaxes(noisy.rollout.observations, 0, 1)
+    return curve, Ranked(observations, lengths, jnp.asarray(np.repeat(curve.values, trajectories), DTYPE))
 
 
-class Regression(NamedTuple):
-    """How rewards are regressed on snippets; the defaults are those released.
+@jax.jit
+def _scored(network: ShapedReward, noisy: NoisyRollout) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
+    """Of the first episode in each environment, its summed rewards and its length."""
+    steps = noisy.steps("executed", network.actions)
+    done = noisy.rollout.terminated | noisy.rollout.truncated
+    live = jnp.cumsum(done, 0) - done == 0
+    lengths = live.sum(0)
+    left = jnp.where((live & steps.terminated).any(0), len(live) - lengths, 0)
+    earned = jnp.where(live, network(steps.observations, steps.actions), 0).sum(0)
+    return earned + left * network.absorbing, lengths
+
+
+# -- the learner ------------------------------------------------------------------------------------------
+
+
+class SSRRTraining(NamedTuple):
+    """How a session trains, after noisy-AIRL.
 
     Fields
     ------
-    hidden : sizes of the hidden layers (ReLU)
-    members : int, networks in the ensemble
-    snippets : int, drawn for each network
-    shortest, longest : int, steps of a snippet
-    points : int
-        States of a snippet at which the network is evaluated. A longer one is represented by so many of its
-        states, one drawn from each of as many equal stretches: much cheaper, and noisier.
-    batch : int, snippets an iteration
-    iterations : int, of Adam
-    learning_rate : float
-    penalty : float, of the sum of the squared weights (not biases)
-    deviation : float, of the first weights
-    held_out : float, share of the snippets not trained on
+    levels : probabilities of a random action at which the first policy is acted out, in increasing order
+    trajectories : int, episodes at each
+    regression : Regression
+    rounds : int, of the second policy, in a session
     """
 
-    hidden: Sequence[int] = (256, 256)
-    members: int = 3
-    snippets: int = 5000
-    shortest: int = 50
-    longest: int = 499
-    points: int = 499
-    batch: int = 64
-    iterations: int = 3000
-    learning_rate: float = 1e-4
-    penalty: float = 0.1
-    deviation: float = 1e-3
-    held_out: float = 0.2
+    levels: Sequence[float] = tuple(0.05 * i for i in range(20))
+    trajectories: int = 5
+    regression: Regression = Regression()
+    rounds: int = 10
 
-    def checked(self) -> Regression:
+    def checked(self) -> SSRRTraining:
         """Itself. Raises ``ValueError`` naming a field that cannot be."""
-        for name in ("members", "shortest", "points", "batch", "iterations"):
+        for name in ("trajectories", "rounds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.longest < self.shortest:
-            raise ValueError(f"longest ({self.longest}) is less than shortest ({self.shortest})")
-        if not 0 < self.held_out < 1:
-            raise ValueError(f"held_out is a share in (0, 1), got {self.held_out}")
-        if self.kept < self.batch:
-            raise ValueError(f"{self.kept} snippets to train on do not fill a batch of {self.batch}")
+        fit_noise_curve(np.array(self.levels), np.zeros(len(self.levels)))
+        self.regression.checked()
         return self
 
+
+class SSRRState(NamedTuple):
+    """All that is carried from session to session.
+
+    Fields
+    ------
+    session : int
+    key : random key
+    first : AdversarialState, noisy-AIRL's
+    network : SSRRReward, the reward learned
+    optimiser : state of its Adam
+    generator : PPOState of the second policy, the one learned
+    """
+
+    session: Int[Array, ""]
+    key: Array
+    first: AdversarialState
+    network: SSRRReward
+    optimiser: Any
+    generator: PPOState
+
     @property
-    def kept(self) -> int:
-        """How many snippets are trained on."""
-        return self.snippets - int(self.held_out * self.snippets)
+    def weights(self) -> Float[np.ndarray, " P"]:
+        """All parameters of the ensemble in one vector."""
+        return np.concatenate([np.ravel(x) for x in jax.tree.leaves(self.network.members)])
 
 
-class SSRRReward(eqx.Module):
-    """Rewards of states: the mean of an ensemble.
-
-    Fields
-    ------
-    members : MLP whose arrays have a leading axis, one entry a network
-    norm : RunningNorm, of observations
-    """
-
-    members: MLP
-    norm: RunningNorm
-
-    @staticmethod
-    def create(key: Array, observation_size: int, settings: Regression) -> SSRRReward:
-        """Networks that are nearly zero: weights normal with the settings' ``deviation``."""
-        sizes = (observation_size, *settings.hidden, 1)
-        keys = jax.random.split(key, len(sizes) - 1)
-        weights = tuple(
-            settings.deviation * jax.random.normal(k, (settings.members, i, o), DTYPE)
-            for k, i, o in zip(keys, sizes[:-1], sizes[1:], strict=True)
-        )
-        biases = tuple(jnp.zeros((settings.members, o), DTYPE) for o in sizes[1:])
-        return SSRRReward(MLP(weights, biases, "relu"), RunningNorm.create(observation_size))
-
-    def each(self, observations: Float[Array, "... d"]) -> Float[Array, "E ..."]:
-        """Every network's reward."""
-        z = self.norm(observations)
-        return jax.vmap(lambda member: member(z)[..., 0])(self.members)
-
-    def __call__(self, observations: Float[Array, "... d"]) -> Float[Array, "..."]:
-        """The ensemble's mean."""
-        return self.each(observations).mean(0)
-
-
-class Ranked(NamedTuple):
-    """Trajectories acted out with noise, and what the noise curve says each is worth.
+class SSRRReport(NamedTuple):
+    """What a session did.
 
     Fields
     ------
-    observations : float ``[n, T, d]``
-    lengths : int ``[n]``
-    worth : float ``[n]``, the curve at the trajectory's level
+    session : int
+    log_likelihood : float
+        Of the expert's reported actions under the second policy, nats a step.
+    curve : NoiseCurve
+    loss, held_out : float ``[members]``
+        Mean squared errors of the regression: on its last batch, and on snippets it did not see.
+    returns : float ``[rounds]``
+        Mean return, by the environment's own reward, of the episodes that the second policy finished; NaN
+        where none ended. Learning never sees it.
+    first : AdversarialReport, noisy-AIRL's
+    pairs, environment_steps : int
+        Reported pairs, and steps of both policies and the ranking, in all sessions so far.
+    iterations : int
+        Rounds of both policies in this session.
+    seconds : float
+    weights : float ``[P]``
     """
 
-    observations: Float[Array, "n T d"]
-    lengths: Int[Array, " n"]
-    worth: Float[Array, " n"]
+    session: int
+    log_likelihood: float
+    curve: NoiseCurve
+    loss: Float[np.ndarray, " members"]
+    held_out: Float[np.ndarray, " members"]
+    returns: Float[np.ndarray, " rounds"]
+    first: AdversarialReport
+    pairs: int
+    environment_steps: int
+    iterations: int
+    seconds: float
+    weights: Float[np.ndarray, " P"]
 
 
-class Snippets(NamedTuple):
-    """Stretches of trajectories, arrays ``[m]``; ``label`` is what their rewards should sum to."""
+def ssrr(
+    agent: PPO,
+    discriminator: Discriminator,
+    noisy: NoisyTraining | None = None,
+    training: SSRRTraining | None = None,
+    configuration: Mapping[str, Any] | None = None,
+) -> Learner:
+    """SSRR as a learner of the session protocol; its demonstrations are :class:`Recording`.
 
-    trajectory: Int[Array, " m"]
-    start: Int[Array, " m"]
-    length: Int[Array, " m"]
-    label: Float[Array, " m"]
-
-
-class Fit(NamedTuple):
-    """Mean squared errors of each network, ``[E]``: on the last batch, and on the snippets held out."""
-
-    trained: Float[Array, " E"]
-    held_out: Float[Array, " E"]
-
-
-def snippet_lengths(settings: Regression, count: int) -> Int[np.ndarray, " m"]:
-    """Lengths evenly spread over ``shortest .. longest``, ascending: the uniform law, in strata."""
-    spread = settings.longest - settings.shortest + 1
-    return settings.shortest + (spread * (np.arange(count) + 0.5) / count).astype(int)
-
-
-def draw_snippets(key: Array, ranked: Ranked, lengths: Int[np.ndarray, " m"]) -> Snippets:
-    """Snippets of the given lengths: trajectory and start uniform; the whole of a shorter trajectory.
-
-    A snippet's label is ``worth * 10 * length / length of the trajectory``.
+    A session is one of noisy-AIRL (see :func:`.noisy_airl.noisy_airl` for the first three parameters), a
+    ranking by noise, a regression and some rounds of a second policy by the reward regressed. Both policies,
+    both rewards and their optimisers go on from where the session before left them; of the demonstrations
+    and the ranked trajectories nothing is kept. Published with SAC and episodes that do not end early; here
+    ``agent`` improves both policies.
     """
-    k_which, k_start = jax.random.split(key)
-    which = jax.random.randint(k_which, lengths.shape, 0, len(ranked.lengths))
-    whole = ranked.lengths[which]
-    length = jnp.minimum(jnp.asarray(lengths), whole)
-    start = jax.random.randint(k_start, lengths.shape, 0, whole - length + 1)
-    return Snippets(which, start, length, (WORTH * ranked.worth[which] * length / whole).astype(DTYPE))
-
-
-class _Packing(NamedTuple):
-    """Where the states of a batch of snippets lie in one array ``[N]`` without gaps; each slot's room."""
-
-    slot: Int[np.ndarray, " N"]
-    place: Int[np.ndarray, " N"]
-    room: Int[np.ndarray, " B"]
-
-    @staticmethod
-    def of(room: Int[np.ndarray, " B"]) -> _Packing:
-        slot = np.repeat(np.arange(len(room)), room)
-        return _Packing(slot, np.concatenate([np.arange(r) for r in room]), room)
-
-    def predicted(
-        self,
-        reward: Callable[[Array], Array],
-        observations: Float[Array, "n T d"],
-        batch: Snippets,
-        key: Array,
-    ) -> Float[Array, " B"]:
-        """Sums of rewards over a batch of snippets that fit their slots."""
-        points = jnp.minimum(batch.length, jnp.asarray(self.room))
-        u = jax.random.uniform(key, self.slot.shape, DTYPE)
-        # A snippet no longer than its slot is taken whole: stretch i is then state i, whatever was drawn.
-        stretch = (batch.length / points).astype(DTYPE)[self.slot]
-        place = jnp.where(
-            stretch > 1, jnp.floor((self.place + u) * stretch), jnp.asarray(self.place, DTYPE)
-        ).astype(jnp.int32)
-        t = batch.start[self.slot] + jnp.minimum(place, batch.length[self.slot] - 1)
-        r = reward(observations[batch.trajectory[self.slot], t])
-        r = jnp.where(self.place < points[self.slot], r * stretch, 0)
-        return jax.ops.segment_sum(r, self.slot, len(self.room), indices_are_sorted=True)
-
-
-def snippet_regression(settings: Regression) -> tuple[Callable[[SSRRReward], Any], Callable[..., tuple]]:
-    """Regression of an ensemble's sums over snippets on their labels, all of it in one compiled program.
-
-    Returns ``init(reward) -> memory``, Adam's, and ``regress(reward, memory, ranked, key) -> (reward, memory,
-    Fit)``. The loss of a network is ``mean (sum_t r(s_t) - label)^2 + penalty * |W|^2``; each has snippets of
-    its own. A batch has one snippet from each stratum of lengths, so that it fills an array of one size: 45 %
-    fewer states than padding each to the longest. Inputs are scaled by the normaliser, which takes the ranked
-    states in first (the released networks see raw observations).
-    """
-    settings = settings.checked()
-    optimiser = optax.adam(settings.learning_rate)
-    kept = snippet_lengths(settings, settings.kept)
-    held = snippet_lengths(settings, settings.snippets - settings.kept)
-    stratum = settings.kept // settings.batch
-    packing = _Packing.of(np.minimum(kept[stratum - 1 :: stratum][: settings.batch], settings.points))
-    # The snippets held out are judged in batches as well, the last of which repeats some.
-    rows = np.minimum(np.arange(-(-len(held) // settings.batch) * settings.batch), len(held) - 1)
-    judging = rows.reshape(-1, settings.batch)
-    wide = _Packing.of(np.full(settings.batch, min(settings.longest, settings.points)))
-
-    def init(reward: SSRRReward) -> Any:
-        return jax.vmap(optimiser.init)(reward.members)
+    environment, settings = agent.environment, agent.settings
+    how = (training or SSRRTraining()).checked()
+    levels = np.array(how.levels)
+    first = noisy_airl(agent, discriminator, noisy)
+    remember, regress = snippet_regression(how.regression)
+    ranking_steps = len(levels) * how.trajectories * environment.horizon
 
     @jax.jit
-    def regress(reward: SSRRReward, memory: Any, ranked: Ranked, key: Array) -> tuple[SSRRReward, Any, Fit]:
-        live = jnp.arange(ranked.observations.shape[1]) < ranked.lengths[:, None]
-        norm = _taken_in(reward.norm, jnp.asarray(ranked.observations, DTYPE), live)
-        states = norm(ranked.observations)
+    def rewarded(network: SSRRReward, rollout: Rollout) -> Float[Array, "T n"]:
+        return network(rollout.observations)
 
-        def one(member: MLP, memory: Any, key: Array) -> tuple[MLP, Any, Fit]:
-            k_kept, k_held, k_steps, k_judge = jax.random.split(key, 4)
-            training = draw_snippets(k_kept, ranked, kept)
+    def init(key: Array) -> SSRRState:
+        k_first, k_network, k_agent, key = jax.random.split(key, 4)
+        network = SSRRReward.create(k_network, environment.observation_size, how.regression)
+        return SSRRState(
+            session=jnp.zeros((), jnp.int64),
+            key=key,
+            first=first.init(k_first),
+            network=network,
+            optimiser=remember(network),
+            generator=agent.init(k_agent),
+        )
 
-            def step(carry: tuple[MLP, Any], key: Array) -> tuple[tuple[MLP, Any], Array]:
-                member, memory = carry
-                k_batch, k_points = jax.random.split(key)
-                first = stratum * jnp.arange(settings.batch)
-                chosen = first + jax.random.randint(k_batch, (settings.batch,), 0, stratum)
-                batch = Snippets(*(x[chosen] for x in training))
+    def update(state: SSRRState, recording: Recording) -> tuple[SSRRState, SSRRReport]:
+        began = time.perf_counter()
+        key, k_rank, k_regress = jax.random.split(state.key, 3)
+        imitated: AdversarialReport
+        imitation, imitated = first.update(state.first, recording)  # type: ignore[arg-type, assignment]
+        curve, ranked = rank(
+            environment, imitation.generator, imitation.network, levels, how.trajectories, k_rank
+        )
+        network, memory, fit = regress(state.network, state.optimiser, ranked, k_regress)
+        acting, returns = state.generator, []
+        for _ in range(how.rounds):
+            before = acting.running
+            acting, rollout = agent.collect(acting)
+            acting = agent.improve(acting, rollout, rewarded(network, rollout))
+            finished = finished_returns(before, rollout)
+            returns.append(finished.mean() if len(finished) else np.nan)
+        state = SSRRState(state.session + 1, key, imitation, network, memory, acting)
+        session = int(state.session)
+        report = SSRRReport(
+            session=session,
+            log_likelihood=float(action_log_likelihood(acting.policy, reported_steps(recording))),
+            curve=curve,
+            loss=np.asarray(fit.trained, np.float64),
+            held_out=np.asarray(fit.held_out, np.float64),
+            returns=np.asarray(returns, np.float64),
+            first=imitated,
+            pairs=imitated.pairs,
+            environment_steps=imitated.environment_steps
+            + session * (ranking_steps + how.rounds * settings.steps),
+            iterations=imitated.iterations + how.rounds,
+            seconds=time.perf_counter() - began,
+            weights=state.weights,
+        )
+        return state, report
 
-                def loss(member: MLP) -> tuple[Array, Array]:
-                    sums = packing.predicted(lambda z: member(z)[..., 0], states, batch, k_points)
-                    error = jnp.mean((sums - batch.label) ** 2)
-                    return error + settings.penalty * sum(jnp.sum(w**2) for w in member.weights), error
-
-                slope, error = jax.grad(loss, has_aux=True)(member)
-                change, memory = optimiser.update(slope, memory, member)
-                return (optax.apply_updates(member, change), memory), error
-
-            keys = jax.random.split(k_steps, settings.iterations)
-            (member, memory), errors = lax.scan(step, (member, memory), keys)
-            judged = draw_snippets(k_held, ranked, held)
-
-            def squares(chosen_and_key: tuple[Array, Array]) -> Array:
-                chosen, k_points = chosen_and_key
-                batch = Snippets(*(x[chosen] for x in judged))
-                return (
-                    wide.predicted(lambda z: member(z)[..., 0], states, batch, k_points) - batch.label
-                ) ** 2
-
-            left = lax.map(squares, (jnp.asarray(judging), jax.random.split(k_judge, len(judging))))
-            return member, memory, Fit(errors[-1], jnp.mean(left.reshape(-1)[: len(held)]))
-
-        keys = jax.random.split(key, settings.members)
-        # One network after the other: each already keeps every core busy.
-        members, memory, fit = lax.map(lambda x: one(*x), (reward.members, memory, keys))
-        return SSRRReward(members, norm), memory, fit
-
-    return init, regress
-
-
-def _taken_in(
-    norm: RunningNorm, observations: Float[Array, "n T d"], live: Bool[Array, "n T"]
-) -> RunningNorm:
-    """The normaliser with the live states taken in (their number is known only to the data)."""
-    weight = live[..., None].astype(DTYPE)
-    n = jnp.sum(weight)
-    mean = jnp.sum(weight * observations, (0, 1)) / n
-    scatter = jnp.sum(weight * (observations - mean) ** 2, (0, 1))
-    total, shift = norm.count + n, mean - norm.mean
-    return RunningNorm(
-        total,
-        norm.mean + shift * n / total,
-        norm.scatter + scatter + shift**2 * norm.count * n / total,
-    )
+    known = {**first.configuration, "ssrr": how._replace(regression=how.regression._asdict())._asdict()}  # type: ignore[arg-type]
+    return Learner("SSRR", first.mdp, {**known, **dict(configuration or {})}, init, update)  # type: ignore[arg-type]

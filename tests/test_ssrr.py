@@ -1,4 +1,5 @@
 import cvxpy as cp
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -6,20 +7,16 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from i2rl.inference.ssrr import (
-    LEAST,
-    MOST,
-    Ranked,
-    Regression,
-    Snippets,
-    SSRRReward,
-    _Packing,
-    draw_snippets,
-    fit_noise_curve,
-    sigmoid_curve,
-    snippet_lengths,
-    snippet_regression,
-)
+from i2rl.inference.discriminator import airl_discriminator
+from i2rl.inference.journal import Journal
+from i2rl.inference.noisy_airl import NoisyTraining
+from i2rl.inference.ppo import ppo
+from i2rl.inference.session import run_sessions
+from i2rl.inference.snippet_regression import Regression
+from i2rl.inference.ssrr import LEAST, MOST, SSRRTraining, fit_noise_curve, rank, sigmoid_curve, ssrr
+from i2rl.models.environment import Environment
+from i2rl.models.networks import ActionSpace
+from i2rl.models.sensing import recording
 
 LEVELS = np.arange(0, 1, 0.05)
 
@@ -109,156 +106,168 @@ def test_measurements_that_cannot_be_fitted_are_refused(levels, returns, named):
         fit_noise_curve(levels, returns)
 
 
-# -- snippets ---------------------------------------------------------------------------------------------
+# -- a slide on which further is better -------------------------------------------------------------------
+
+PUSH = ActionSpace(0, (-1.0,), (1.0,))
 
 
-def test_lengths_are_uniform_between_their_bounds():
-    lengths = snippet_lengths(Regression(), 4500)
-    assert (np.diff(lengths) >= 0).all()
-    values, counts = np.unique(lengths, return_counts=True)
-    np.testing.assert_array_equal(values, np.arange(50, 500))
-    assert (counts == 10).all()
+def slid(state, action):
+    push = jnp.clip(action[..., 0], -1, 1).astype(state.dtype)
+    return jnp.stack([0.9 * state[..., 0] + 0.1 * push, state[..., 1]], -1)
 
 
-def test_snippets_lie_in_their_trajectories_and_are_worth_their_share():
-    lengths = np.array([300, 90, 40])
-    worth = np.array([1.0, 0.5, 0.2])
-    ranked = Ranked(jnp.zeros((3, 300, 1)), jnp.asarray(lengths), jnp.asarray(worth))
-    wanted = np.tile(np.arange(50, 120), 60)
-    which, start, length, label = map(np.asarray, draw_snippets(jax.random.key(0), ranked, wanted))
-    np.testing.assert_array_equal(length, np.minimum(wanted, lengths[which]))
-    assert ((start >= 0) & (start + length <= lengths[which])).all()
-    np.testing.assert_allclose(label, 10 * worth[which] * length / lengths[which], rtol=1e-6)
-    shares = np.bincount(which) / len(which)
-    np.testing.assert_allclose(shares, 1 / 3, atol=4 * np.sqrt(2 / 9 / len(which)))
-    # All places that a snippet of 60 steps can begin at in 300 steps are as likely.
-    mean = start[(which == 0) & (wanted == 60)].mean()
-    assert mean == pytest.approx(120, abs=4 * 241 / np.sqrt(12 * 20))
+def slide(horizon: int, wall: float = np.inf) -> Environment:
+    """A block pushed along; the reward is its place, and beside it is something that does not matter."""
+
+    def step(state, action):
+        following = slid(state, action)
+        return following, following[0], following[0] < -wall
+
+    def reset(key):
+        return jnp.stack([jnp.zeros((), jnp.float32), jax.random.normal(key, (), jnp.float32)])
+
+    return Environment("slide", 2, (-1.0, -9.0), (1.0, 9.0), PUSH, horizon, reset, step, lambda s: s, slid)
+
+
+def place_reward(slope: float, absorbing: float):
+    """A state reward ``slope * place``."""
+    network = airl_discriminator(2, PUSH, state_only=True, reward=()).init(jax.random.key(0))
+    chosen = (jnp.array([[slope], [0.0]], jnp.float32), jnp.float32(absorbing))
+    return eqx.tree_at(lambda n: (n.reward.weights[0], n.absorbing), network, chosen)
 
 
 @pytest.fixture(scope="module")
-def batch():
+def agent():
+    settings = {"n_envs": 10, "n_steps": 80, "minibatch": 80, "learning_rate": 1e-3, "log_deviation": -1.0}
+    return ppo(slide(40), scale_rewards=True, **settings)
+
+
+def pushing(agent, strength):
+    state = agent.init(jax.random.key(0))
+    pushes = jnp.full(1, strength, jnp.float32)
+    return state._replace(policy=eqx.tree_at(lambda p: p.mean.biases[-1], state.policy, pushes))
+
+
+def test_trajectories_are_worth_what_their_noise_leaves_of_the_reward(agent):
+    curve, ranked = rank(
+        agent.environment, pushing(agent, 0.8), place_reward(2.0, 0.0), LEVELS, 20, jax.random.key(1)
+    )
+    assert ranked.observations.shape == (400, 40, 2)
+    assert (ranked.lengths == 40).all()
+    np.testing.assert_array_equal(ranked.worth, np.repeat(curve.values, 20).astype(np.float32))
+    returns = 2 * np.asarray(ranked.observations)[..., 0].sum(1).reshape(20, 20).mean(1)
+    np.testing.assert_allclose(curve.scores, (returns - returns.min()) / np.ptp(returns), atol=1e-4)
+    # With probability eps a push is nought on average: the expected place is proportional to 1 - eps.
+    np.testing.assert_allclose(returns / returns[0], 1 - LEVELS, atol=0.15)
+    assert curve.explained > 0.95
+
+
+def test_what_is_left_of_an_episode_that_ended_is_spent_in_the_absorbing_state(agent):
+    environment = slide(40, wall=0.3)
+    levels = np.array([0.0, 0.3, 0.6, 0.9])
+    curve, ranked = rank(
+        environment, pushing(agent, -0.6), place_reward(1.0, -2.0), levels, 10, jax.random.key(1)
+    )
+    lengths, place = np.asarray(ranked.lengths), np.asarray(ranked.observations)[..., 0]
+    assert (lengths < 40).any()
+    assert (lengths == 40).any()
+    scores = [x[:n].sum() - 2 * (40 - n) for x, n in zip(place, lengths, strict=True)]
+    returns = np.reshape(scores, (4, 10)).mean(1)
+    np.testing.assert_allclose(curve.scores, (returns - returns.min()) / np.ptp(returns), atol=1e-4)
+    # Before its end no episode was beyond the wall, and the step that ended it led there.
+    for x, n in zip(place, lengths, strict=True):
+        assert (x[:n] >= -0.3).all()
+        assert n == 40 or x[n - 1] < -0.3 / 0.9 + 0.1 / 0.9
+
+
+# -- the learner ------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def demonstration():
+    """An expert who pushes at half strength."""
     rng = np.random.default_rng(0)
-    length = np.array([3, 9, 20, 31])
-    return rng.normal(size=(5, 40, 2)), Snippets(
-        jnp.array([0, 4, 2, 2]), jnp.array([37, 0, 11, 9]), jnp.asarray(length), jnp.zeros(4)
-    )
-
-
-def sums(observations, batch):
-    return np.array(
-        [
-            np.sin(observations[i, s : s + n]).sum()
-            for i, s, n in zip(*map(np.asarray, batch[:3]), strict=True)
-        ]
-    )
-
-
-def test_packed_snippets_sum_to_what_a_loop_sums(batch):
-    observations, snippets = batch
-    packed = _Packing.of(np.array([5, 9, 25, 31]))
-    assert len(packed.slot) == 70
-    predicted = packed.predicted(
-        lambda x: jnp.sin(x).sum(-1), jnp.asarray(observations), snippets, jax.random.key(0)
-    )
-    np.testing.assert_allclose(predicted, sums(observations, snippets), rtol=1e-5)
-
-
-def test_sums_from_some_of_the_states_are_right_on_average(batch):
-    observations, snippets = batch
-    packed = _Packing.of(np.array([4, 4, 4, 4]))
-    keys = jax.random.split(jax.random.key(1), 4000)
-    drawn = np.asarray(
-        jax.vmap(
-            lambda k: packed.predicted(lambda x: jnp.sin(x).sum(-1), jnp.asarray(observations), snippets, k)
-        )(keys)
-    )
-    error = drawn.std(0) / np.sqrt(len(drawn))
-    assert (np.abs(drawn.mean(0) - sums(observations, snippets)) < 4 * error + 1e-4).all()
-    assert error[0] < 1e-6  # three states fit into four places
-
-
-# -- regression -------------------------------------------------------------------------------------------
-
-
-def linear_trajectories(weights, n=40, length=120, shortest=60, seed=0):
-    """States whose reward ``weights . s`` is the trajectory's worth at every step, and all else noise."""
-    rng = np.random.default_rng(seed)
-    worth = rng.random(n)
-    states = rng.normal(size=(n, length, len(weights)))
-    unit = weights / np.linalg.norm(weights)
-    states -= (states @ unit)[..., None] * unit
-    states += worth[:, None, None] * weights / (weights @ weights)
-    lengths = rng.integers(shortest, length + 1, n)
-    states[np.arange(length) >= lengths[:, None]] = 1e3  # padding, which must not count
-    return Ranked(jnp.asarray(states, jnp.float32), jnp.asarray(lengths), jnp.asarray(worth))
-
-
-def test_a_linear_ensemble_finds_the_linear_reward():
-    weights = np.array([1.0, -2.0, 0.5])
-    ranked = linear_trajectories(weights, length=100, shortest=100)
-    settings = Regression(
-        hidden=(), members=2, snippets=400, shortest=10, longest=40, iterations=1500, learning_rate=1e-2,
-        batch=32, penalty=0.0,
-    )  # fmt: skip
-    init, regress = snippet_regression(settings)
-    reward = SSRRReward.create(jax.random.key(0), 3, settings)
-    reward, _, fit = regress(reward, init(reward), ranked, jax.random.key(1))
-    fresh = np.random.default_rng(5).normal(size=(50, 3))
-    # Labels are 10 worth length / 100, so a step's reward is a tenth of its worth.
-    np.testing.assert_allclose(reward(fresh), 0.1 * fresh @ weights, atol=2e-3)
-    assert (np.asarray(fit.held_out) < 1e-3).all()
+    observations, actions = [], []
+    for _ in range(6):
+        states, pushes = [np.array([0, rng.normal()])], rng.normal(0.5, 0.1, (40, 1))
+        for push in pushes[:-1]:
+            states.append(np.asarray(slid(states[-1], push)))
+        observations.append(np.array(states))
+        actions.append(pushes)
+    return recording(observations, actions)
 
 
 @pytest.fixture(scope="module")
-def reduced():
-    settings = Regression(
-        hidden=(32, 32), members=2, snippets=600, shortest=10, longest=60, points=20, iterations=400,
-        learning_rate=2e-3, batch=32, penalty=1e-3, deviation=0.2,
+def learner(agent):
+    regression = Regression(
+        hidden=(32, 32), members=2, snippets=1000, shortest=5, longest=30, batch=32, iterations=500,
+        learning_rate=1e-3, penalty=1e-3, deviation=0.1,
     )  # fmt: skip
-    return settings, *snippet_regression(settings)
+    return ssrr(
+        agent,
+        airl_discriminator(2, PUSH, state_only=True),
+        NoisyTraining(rounds=30, updates=16, batch=128, learning_rate=3e-3, replay=5),
+        SSRRTraining(regression=regression, rounds=40),
+    )
 
 
-def test_networks_find_the_reward_up_to_scale(reduced):
-    settings, init, regress = reduced
-    weights = np.array([1.0, -2.0, 0.5])
-    ranked = linear_trajectories(weights)
-    reward = SSRRReward.create(jax.random.key(0), 3, settings)
-    learned, _, fit = regress(reward, init(reward), ranked, jax.random.key(1))
-    fresh = linear_trajectories(weights, seed=9).observations[:, :60]
-    assert np.corrcoef(np.ravel(learned(fresh)), np.ravel(fresh @ weights))[0, 1] > 0.9
-    assert fit.trained.shape == fit.held_out.shape == (2,)
-    # The normaliser saw the live states and no padding.
-    live = np.arange(120) < np.asarray(ranked.lengths)[:, None]
-    seen = np.asarray(ranked.observations)[live]
-    np.testing.assert_allclose(learned.norm.mean, seen.mean(0), atol=1e-4)
-    np.testing.assert_allclose(learned.norm.deviation, seen.std(0), rtol=1e-3)
+@pytest.fixture(scope="module")
+def sessions(learner, demonstration):
+    kept = []
+    run_sessions(learner, [demonstration] * 2, key=jax.random.key(0), on_session=lambda *x: kept.append(x))
+    return kept
 
 
-def test_the_ensemble_is_the_mean_of_members_with_snippets_of_their_own(reduced):
-    settings, init, regress = reduced
-    reward = SSRRReward.create(jax.random.key(0), 3, settings)
-    ranked = linear_trajectories(np.ones(3))
-    learned, _, _ = regress(reward, init(reward), ranked, jax.random.key(2))
-    again, _, _ = regress(reward, init(reward), ranked, jax.random.key(2))
-    for one, other in zip(jax.tree.leaves(learned), jax.tree.leaves(again), strict=True):
-        np.testing.assert_array_equal(one, other)
-    x = np.random.default_rng(0).normal(size=(4, 7, 3))
-    each = np.asarray(learned.each(x))
-    assert each.shape == (2, 4, 7)
-    np.testing.assert_allclose(learned(x), each.mean(0), rtol=1e-6)
-    assert np.abs(each[0] - each[1]).max() > 1e-4
+def test_noise_teaches_what_is_better_than_what_was_shown(agent, sessions, demonstration):
+    state, report = sessions[0]
+    shown = np.asarray(demonstration.observations)[..., 0].sum(1).mean()
+    imitated = agent.evaluate(state.first.generator.policy, jax.random.key(1), 10).returns.mean()
+    learned = agent.evaluate(state.generator.policy, jax.random.key(1), 10).returns.mean()
+    assert imitated == pytest.approx(shown, rel=0.3)
+    assert learned > 1.5 * shown
+    assert report.curve.explained > 0.5
+    line = np.stack([np.linspace(-1, 1, 21), np.zeros(21)], 1)
+    assert np.corrcoef(state.network(line), line[:, 0])[0, 1] > 0.9
+
+
+def test_everything_is_carried_between_sessions(sessions):
+    state, report = sessions[-1]
+    assert int(state.session) == int(state.first.session) == report.session == 2
+    assert (state.optimiser[0].count == 2 * 500).all()
+    assert int(state.generator.updates) == 2 * 40
+    assert int(state.first.generator.updates) == 2 * 30
+    assert report.pairs == 2 * 240
+    assert report.environment_steps == 2 * ((30 + 40) * 800 + 20 * 5 * 40)
+    assert report.returns.shape == (40,)
+    # The ensemble's statistic of inputs holds the ranked states of both sessions.
+    assert float(state.network.norm.count) == 2 * 20 * 5 * 40
+
+
+def test_a_run_resumed_from_its_journal_equals_an_uninterrupted_one_to_the_bit(
+    learner, demonstration, sessions, tmp_path
+):
+    with Journal.open(tmp_path / "run.journal", learner) as journal:
+        journal.commit(*sessions[0])
+    with Journal.open(tmp_path / "run.journal", learner) as journal:
+        resumed = run_sessions(learner, [demonstration], journal=journal).state
+
+    def bits(x) -> bytes:
+        x = jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x
+        return np.asarray(x).tobytes()
+
+    leaves = zip(jax.tree.leaves(resumed), jax.tree.leaves(sessions[1][0]), strict=True)
+    assert all(bits(a) == bits(b) for a, b in leaves)
 
 
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [
-        ({"members": 0}, "members"),
-        ({"longest": 10}, "longest"),
-        ({"held_out": 1.0}, "held_out"),
-        ({"snippets": 40}, "batch of 64"),
+        ({"rounds": 0}, "rounds"),
+        ({"trajectories": 0}, "trajectories"),
+        ({"levels": (0.0, 0.5)}, "four levels"),
+        ({"regression": Regression(members=0)}, "members"),
     ],
 )
-def test_a_regression_that_cannot_be_is_refused_by_name(wrong, named):
+def test_training_that_cannot_be_is_refused_by_name(agent, wrong, named):
     with pytest.raises(ValueError, match=named):
-        snippet_regression(Regression(**wrong))
+        ssrr(agent, airl_discriminator(2, PUSH), training=SSRRTraining(**wrong))
