@@ -55,7 +55,8 @@ class Settings(NamedTuple):
     hidden : layers of the policy and of the critic
     log_deviation : float, of continuous actions at first
     scale_observations : whether networks see observations in deviations from their mean so far
-    scale_rewards : whether rewards are divided by the deviation of discounted returns so far
+    scale_rewards : whether rewards are divided by the deviation of discounted returns so far, and cut off at
+        ten: for rewards of unknown size, and where large values of the critic would crowd out the policy
     reward_memory : float, steps that this deviation remembers; fewer where the reward itself is learned
     """
 
@@ -158,7 +159,9 @@ class PPO(NamedTuple):
 def ppo(environment: Task, **settings: Any) -> PPO:
     """An agent for a task, by the :class:`Settings` given by name.
 
-    Raises ``ValueError`` for a setting out of its range.
+    Scaled observations help where their coordinates differ in size, as a robot's do; the cart-pole, which
+    they hinder, is learned in 25,000 steps with ``learning_rate=1e-3``, ``scale_observations=False`` and
+    ``scale_rewards=True``. Raises ``ValueError`` for a setting out of its range.
     """
     chosen = _checked(Settings(**settings))
 
