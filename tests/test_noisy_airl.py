@@ -39,18 +39,21 @@ class Drifting(NamedTuple):
         return np.asarray(jax.random.uniform(key, (n, 2), jnp.float32, -0.1, 0.1))
 
     def step(self, states, actions):
-        states = states + np.clip(actions, BOX.low, BOX.high).astype(np.float32)
+        states = self.next_state(states, actions)
         return states, states[:, 0], np.abs(states[:, 0]) > 3
 
     def observe(self, states):
         return states
+
+    def next_state(self, observations, actions):
+        return observations + np.clip(actions, BOX.low, BOX.high).astype(np.float32)
 
 
 def parts(environment, key=0):
     k_policy, k_critic = jax.random.split(jax.random.key(key))
     size, actions = environment.observation_size, environment.actions
     kind = CategoricalPolicy if actions.discrete else GaussianPolicy
-    return kind.create(k_policy, size, actions, (8,)), MLP.create(k_critic, (size, 8, 1))
+    return kind.create(k_policy, size, actions), MLP.create(k_critic, (size, 32, 32, 1))
 
 
 # -- importance weights -----------------------------------------------------------------------------------
@@ -99,44 +102,47 @@ def test_without_noise_every_action_counts_once():
 # -- acting with noise ------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("environment", [mountain_car(horizon=50), Drifting()])
-def test_what_is_executed_is_what_happens_and_what_is_intended_is_recorded(environment):
-    levels = np.array([0.0, 0.0, 0.25, 0.6])
+def acted_out(environment, levels, length, steps=0):
+    """A policy acting with noise, in episodes that have lasted some steps already."""
     policy, critic = parts(environment)
-    running = begin(environment, jax.random.key(1), 4)
-    running, (rollout, executed) = roll_out_noisily(
-        environment, policy, critic, running, levels, jax.random.key(2), 400
-    )
-    r, executed = jax.tree.map(np.asarray, rollout), np.asarray(executed)
-    if isinstance(environment, Drifting):
-        following = environment.step(r.observations.reshape(-1, 2), executed.reshape(-1, 2))[0]
-        changed = (executed != r.actions).any(-1)
-        chance = levels
-    else:
-        following = environment.next_state(r.observations, executed)
-        changed = executed != r.actions
-        chance = levels * 2 / 3
-    np.testing.assert_allclose(r.next_observations, np.reshape(following, (400, 4, 2)), atol=1e-6)
-    np.testing.assert_allclose(changed.mean(0), chance, atol=0.1)
-    assert not changed[:, :2].any()
+    running = begin(environment, jax.random.key(1), len(levels))
+    running = running._replace(steps=running.steps + steps)
+    _, noisy = roll_out_noisily(environment, policy, critic, running, levels, jax.random.key(2), length)
+    return policy, critic, jax.tree.map(np.asarray, noisy)
+
+
+@pytest.mark.parametrize(
+    ("environment", "levels", "length", "steps", "unlike"),
+    [
+        (cart_pole(100), np.repeat([0.0, 0.6], 5), 128, 97, 1 / 2),
+        (Drifting(), np.array([0.0, 0.0, 0.25, 0.6]), 400, 0, 1),
+    ],
+)
+def test_what_is_executed_is_what_happens_and_what_is_intended_is_recorded(
+    environment, levels, length, steps, unlike
+):
+    policy, critic, (r, executed) = acted_out(environment, levels, length, steps)
+    changed = (executed != r.actions).reshape(length, len(levels), -1).any(-1)
+    following = environment.next_state(r.observations, executed)
+    np.testing.assert_allclose(r.next_observations, following, atol=1e-6)
+    # Random actions may be what was intended.
+    np.testing.assert_allclose(changed.mean(0), levels * unlike, atol=4 * np.sqrt(0.25 / length))
+    assert not changed[:, levels == 0].any()
     np.testing.assert_allclose(r.log_probs, policy.log_prob(r.observations, r.actions), rtol=1e-5)
     np.testing.assert_allclose(r.values, critic(policy.norm(r.observations))[..., 0], rtol=1e-4, atol=1e-5)
     # One step's successor is the next one's state, except where an episode ends.
     done = r.terminated | r.truncated
     gone_on = ~done[:-1]
     np.testing.assert_array_equal(r.observations[1:][gone_on], r.next_observations[:-1][gone_on])
-    assert done.any()
-    assert (np.abs(r.observations[1:][~gone_on][:, 1]) <= 0.1).all()
+    assert done.any(0).all()
+    assert (np.abs(r.observations[1:][~gone_on]) <= 0.1).all()
+    assert r.truncated[environment.horizon - steps - 1].any()
     assert (np.diff(np.flatnonzero(done[:, 0])) <= environment.horizon).all()
 
 
 def test_random_actions_are_uniform_over_the_box():
-    environment = Drifting()
-    policy, critic = parts(environment)
-    running = begin(environment, jax.random.key(1), 8)
-    _, noisy = roll_out_noisily(environment, policy, critic, running, np.full(8, 0.5), jax.random.key(3), 500)
-    executed = np.asarray(noisy.executed)
-    random = executed[(executed != np.asarray(noisy.rollout.actions)).any(-1)]
+    _, _, (rollout, executed) = acted_out(Drifting(), np.full(8, 0.5), 500)
+    random = executed[(executed != rollout.actions).any(-1)]
     assert len(random) == pytest.approx(2000, abs=4 * np.sqrt(1000))
     low, high = np.array(BOX.low), np.array(BOX.high)
     assert ((random >= low) & (random <= high)).all()
@@ -147,15 +153,12 @@ def test_random_actions_are_uniform_over_the_box():
 
 @pytest.mark.parametrize("shown", ["intended", "executed"])
 def test_the_discriminator_is_shown_either_action_within_the_bounds(shown):
-    environment = Drifting()
-    policy, critic = parts(environment)
-    running = begin(environment, jax.random.key(1), 2)
-    _, noisy = roll_out_noisily(
-        environment, policy, critic, running, np.array([0.0, 0.9]), jax.random.key(3), 50
-    )
-    seen = noisy.steps(shown, BOX).actions
+    _, _, noisy = acted_out(Drifting(), np.array([0.0, 0.9]), 50)
     source = noisy.executed if shown == "executed" else noisy.rollout.actions
-    np.testing.assert_array_equal(seen, np.clip(source, *np.float32([BOX.low, BOX.high])))
+    assert (np.abs(source) > 1).any() or shown == "executed"
+    np.testing.assert_array_equal(
+        noisy.steps(shown, BOX).actions, np.clip(source, *np.float32([BOX.low, BOX.high]))
+    )
 
 
 # -- the objective ----------------------------------------------------------------------------------------
@@ -205,7 +208,7 @@ TRAINING = NoisyTraining(rounds=12, updates=16, batch=128, learning_rate=3e-3, r
 
 @pytest.fixture(scope="module")
 def agent():
-    return ppo(cart_pole(), n_envs=10, n_steps=128, learning_rate=1e-3, scale_rewards=True)
+    return ppo(cart_pole(100), n_envs=10, n_steps=128, learning_rate=1e-3, scale_rewards=True)
 
 
 @pytest.fixture(scope="module")
@@ -216,7 +219,7 @@ def learner(agent):
 @pytest.fixture(scope="module")
 def demonstration():
     """A pole balanced by pushing to where it falls."""
-    environment = cart_pole()
+    environment = cart_pole(100)
     step, observe = jax.jit(environment.step), jax.jit(environment.observe)
     observations, actions = [], []
     state = environment.reset(jax.random.key(5))
@@ -281,7 +284,7 @@ def test_reports_are_plain_numbers_of_what_happened(demonstration, sessions):
 def test_the_pole_is_balanced_by_imitation_despite_the_noise(agent, sessions):
     assert sessions[0][1].returns[0] < 40
     learned = sessions[-1][0].generator.policy
-    assert agent.evaluate(learned, jax.random.key(1), 10).returns.mean() > 200
+    assert agent.evaluate(learned, jax.random.key(1), 10).returns.mean() > 80
 
 
 def test_the_host_is_acted_in_as_well(tmp_path):
