@@ -187,8 +187,7 @@ class GaussianGibbs(NamedTuple):
     Fields
     ------
     truth : GaussianTruth
-        Dynamics, ``Q``, the law of ``s_0``, the number of draws (chains, ``M``) and the widths; the last of
-        the widths is used throughout.
+        Dynamics (with ``jacobians``), ``Q``, the law of ``s_0`` and the number of draws (chains, ``M``).
     sweeps : int
         Of a refresh, after which the draws are the chains as they are.
     """
@@ -198,12 +197,11 @@ class GaussianGibbs(NamedTuple):
 
     def init(self, reported: Recording) -> GibbsChain:
         """Every chain starts at the reports."""
-        start = self.truth.init(reported).point
         shape = (self.truth.draws, 1, 1, 1)
         return GibbsChain(
             reported,
-            jnp.tile(start.observations, shape),
-            jnp.tile(start.actions, shape),
+            jnp.tile(reported.observations, shape),
+            jnp.tile(reported.actions, shape),
             jnp.zeros(()),
             jnp.zeros(()),
         )
@@ -216,13 +214,12 @@ class GaussianGibbs(NamedTuple):
         sensor = sensor.sized(chain.observations.shape[-1], chain.actions.shape[-1])
         sweep = _compiled_sweep if isinstance(t.dynamics, JaxDynamics) else _sweep
         for key_sweep in jax.random.split(key, self.sweeps):
-            chain = sweep(t.dynamics, t.widths[-1:], t.model, policy, sensor, chain, key_sweep)
+            chain = sweep(t.dynamics, t.model, policy, sensor, chain, key_sweep)
         return chain, truths(chain.reported, chain.observations, chain.actions)
 
 
 def _sweep(
     dynamics: Any,
-    width: tuple[float, ...],
     model: Model,
     policy: Any,
     sensor: GaussianSensor,
@@ -233,19 +230,18 @@ def _sweep(
     updates = (("states", 0, 2), ("states", 1, 2), ("actions", 0, 1))
     for (which, first, stride), k in zip(updates, jax.random.split(key, 3), strict=True):
         steps = np.arange(first, length, stride)
-        chain = _update(which, steps, dynamics, width, model, policy, sensor, chain, k)
+        chain = _update(which, steps, dynamics, model, policy, sensor, chain, k)
     return chain
 
 
 # A simulator is no part of a compiled function.
-_compiled_sweep = jax.jit(_sweep, static_argnums=(0, 1))
+_compiled_sweep = jax.jit(_sweep, static_argnums=0)
 
 
 def _update(
     which: str,
     steps: np.ndarray,
     dynamics: Any,
-    width: tuple[float, ...],
     model: Model,
     policy: Any,
     sensor: GaussianSensor,
@@ -275,9 +271,9 @@ def _update(
         followed=tiled(reported.followed[:, steps]),
     )
     value = rows(moving[:, :, steps])
-    at = _tangent(which, dynamics, width, value, blanket.other)
+    at = _tangent(which, dynamics, value, blanket.other)
     candidate = _proposed(which, key_move, model, policy, sensor, blanket, at)
-    to = _tangent(which, dynamics, width, candidate, blanket.other)
+    to = _tangent(which, dynamics, candidate, blanket.other)
     log_ratio = _log_acceptance(which, model, policy, sensor, blanket, at, to)
     live = tiled(reported.live[:, steps])
     accept = live & (jnp.log(jax.random.uniform(key_accept, log_ratio.shape)) < log_ratio)
@@ -299,7 +295,7 @@ def _next(dynamics: Any, s: Array, a: Array) -> Array:
     return jnp.asarray(dynamics.next_state(*_native(dynamics, s, a)))
 
 
-def _tangent(which: str, dynamics: Any, width: tuple[float, ...], value: Array, other: Array) -> _Tangent:
+def _tangent(which: str, dynamics: Any, value: Array, other: Array) -> _Tangent:
     s, a = _native(dynamics, *((value, other) if which == "states" else (other, value)))
-    slopes = dynamics.jacobians(s, a, *(() if isinstance(dynamics, JaxDynamics) else width))
+    slopes = dynamics.jacobians(s, a)
     return _Tangent(value, _next(dynamics, s, a), jnp.asarray(slopes[0 if which == "states" else 1]))

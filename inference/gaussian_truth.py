@@ -2,11 +2,15 @@
 
 Every term of Eq. 6.10 is Gaussian about a function of the truth: T1 and T3 ``s_{t+1} ~ N(f(s_t, a_t), Q)``,
 T2 ``a_t ~ pi(. | s_t)``, T4 and T5 the sensor, whose data are the *reports*; ``s_0`` has a wide Gaussian.
-The pairs of a trajectory then are one chain, and its joint posterior is found by the iterated extended
-Kalman smoother (Bell 1994): dynamics and policy are linearised about the estimate, the affine chain is
-smoothed exactly, and the estimate moves towards the result as far as the exact joint density rises
-(Särkkä and Svensson 2020). It is exact for affine dynamics and policies; elsewhere draws are those of the
-Gaussian about the likeliest trajectory. :mod:`.gaussian_gibbs` samples the same posterior without that.
+The pairs of a trajectory then are one chain, and its joint posterior is found by an iterated Kalman smoother:
+dynamics and policy are replaced by affine functions about the posterior so far, the affine chain is smoothed
+exactly, and so on (posterior linearisation; García-Fernández, Svensson and Särkkä 2017).
+
+Slopes are taken across the posterior, by divided differences along its axes, and what an affine function
+leaves over of the dynamics is added to ``Q`` (Nørgaard, Poulsen and Ravn 2000). So a foot that may or may not
+touch the ground loosens its own step and no other, and tightens it again as the posterior narrows; slopes at
+a point (the extended Kalman smoother) make velocities *worse* than the reports there. For affine dynamics and
+policies the first pass is exact. :mod:`.gaussian_gibbs` samples the posterior without the approximation.
 """
 
 from __future__ import annotations
@@ -19,7 +23,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float
+from jax.scipy.linalg import solve_triangular
+from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..models.sensing import (
     GaussianSensor,
@@ -39,11 +44,15 @@ from .kalman import (
     smooth_filtered,
 )
 
-STEPS = (1.0, 0.5, 0.25, 0.1)
-"""Shares of the way to the smoothed mean that are tried."""
-
 FURTHEST = 6.0
 """Standard deviations of the sensor beyond which a report is not believed to be from the truth."""
+
+CAUTION = ((1.0, 30.0), (3.0, 20.0), (2.0, 10.0), (1.5, 5.0), (1.0, 3.0))
+"""Of the first passes and, the last of them, of all later ones: by how much the posterior is widened before
+differences are taken across it, and by how much what they leave over counts (they see each axis, not how axes
+bend together). Nothing where the dynamics are affine."""
+
+_REACH = 3.0**0.5  # in deviations: matches a Gaussian's fourth moment
 
 
 class Dynamics(Protocol):
@@ -68,29 +77,38 @@ def jax_dynamics(f: Callable[[Array, Array], Array]) -> JaxDynamics:
     return JaxDynamics(jax.jit(jax.vmap(f)), jax.jit(jax.vmap(jax.jacfwd(f, (0, 1)))))
 
 
-class Point(NamedTuple):
-    """An estimate of the truth, and the dynamics linearised about it.
+class TruthChain(NamedTuple):
+    """What is kept between calls: the reports, the posterior so far and the dynamics linearised across it.
 
     Fields
     ------
-    observations, actions : float ``[n, L, d]``, ``[n, L, k]``
-    following : float ``[n, L, d]``
-        ``f(s_t, a_t)``.
-    by_state, by_action : float ``[n, L, d, d]``, ``[n, L, d, k]``
+    reported : Recording
+    means, covariances : float ``[n, L, D]``, ``[n, L, D, D]``
+        Of the pairs ``(s, a)``, ``D = d + k``.
+    following, slope : float ``[n, L, d]``, ``[n, L, d, D]``
+        Value and slope of ``f`` at ``centre``.
+    centre : float ``[n, L, D]``
+    remainder : float ``[n, L, d, d]``
+        Covariance of what the affine function leaves over.
+    passes : int
+        Made so far.
     """
 
-    observations: Float[Array, "n L d"]
-    actions: Float[Array, "n L k"]
-    following: Float[Array, "n L d"]
-    by_state: Float[Array, "n L d d"]
-    by_action: Float[Array, "n L d k"]
-
-
-class TruthChain(NamedTuple):
-    """What is kept between calls: the reports, and the estimate so far."""
-
     reported: Recording
-    point: Point
+    means: Float[Array, "n L D"]
+    covariances: Float[Array, "n L D D"]
+    following: Float[Array, "n L d"]
+    slope: Float[Array, "n L d D"]
+    centre: Float[Array, "n L D"]
+    remainder: Float[Array, "n L d d"]
+    passes: Int[Array, ""]
+
+
+class Bounds(NamedTuple):
+    """Within which the pairs ``(s, a)`` lie, ``[D]`` or a number."""
+
+    low: Float[Array, "*D"]
+    high: Float[Array, "*D"]
 
 
 class Model(NamedTuple):
@@ -127,42 +145,35 @@ def linear_policy(policy: Any, observations: Float[Array, "N d"]) -> tuple[Array
     return means, jax.vmap(jax.jacfwd(mean))(observations), covariances
 
 
-def _affine_chains(
-    model: Model, policy: Any, sensor: GaussianSensor, reported: Recording, point: Point
-) -> AffineGaussian:
+def _affine_chains(model: Model, policy: Any, sensor: GaussianSensor, chain: TruthChain) -> AffineGaussian:
     """The chain of pairs ``(s, a)``, linearised; every field with a leading ``n``.
 
     The action is drawn from the state it is taken in: ``a' = mu + K (s' - s0') + N(0, Sigma)``, hence
     ``(s', a')`` has the transition ``[I; K] [A, B]`` and the noise ``[I; K] Q [I; K]' + diag(0, Sigma)``.
     """
-    n, length, d = point.observations.shape
-    k = point.actions.shape[-1]
-    flat = point.observations.reshape(-1, d)
-    mu, K, sigma = (x.reshape(n, length, *x.shape[1:]) for x in linear_policy(policy, flat))
-    intercept = mu - jnp.einsum("ntkd,ntd->ntk", K, point.observations)
+    n, length, d, D = chain.slope.shape
+    states = chain.centre[..., :d]
+    linear = linear_policy(policy, states.reshape(-1, d))
+    mu, K, sigma = (x.reshape(n, length, *x.shape[1:]) for x in linear)
+    intercept = mu - jnp.einsum("ntkd,ntd->ntk", K, states)
     lift = jnp.concatenate([jnp.broadcast_to(jnp.eye(d), (n, length, d, d)), K], 2)
-    # Beyond a trajectory's end anything finite will do, and zeros cannot grow.
-    followed = reported.followed[:, :-1, None, None]
-    slope = jnp.concatenate([point.by_state, point.by_action], -1)[:, :-1]
-    pairs = jnp.concatenate([point.observations, point.actions], -1)
-    start = point.following[:, :-1] - jnp.einsum("ntij,ntj->nti", slope, pairs[:, :-1])
-    D = d + k
+    start = chain.following - jnp.einsum("ntij,ntj->nti", chain.slope, chain.centre)
+    noise = model.process_covariance + chain.remainder
 
-    def action_block(covariance: Array) -> Array:
-        return jnp.zeros((*covariance.shape[:-2], D, D)).at[..., d:, d:].set(covariance)
+    def with_action(covariance: Array, which: Array, action: Array) -> Array:
+        return (which @ covariance @ which.swapaxes(-1, -2)).at[..., d:, d:].add(action)
 
-    def lifted(covariance: Array, which: Array) -> Array:
-        return which @ covariance @ which.swapaxes(-1, -2)
-
-    offset = jnp.einsum("ntij,ntj->nti", lift[:, 1:], start).at[..., d:].add(intercept[:, 1:])
+    offset = jnp.einsum("ntij,ntj->nti", lift[:, 1:], start[:, :-1]).at[..., d:].add(intercept[:, 1:])
     first = jnp.einsum("nij,j->ni", lift[:, 0], model.initial_mean).at[:, d:].add(intercept[:, 0])
     R = jax.scipy.linalg.block_diag(sensor.state_covariance, sensor.action_covariance)
+    # Beyond a trajectory's end anything finite will do, and zeros cannot grow.
+    followed = chain.reported.followed[:, :-1, None, None]
     return AffineGaussian(
         first,
-        lifted(model.initial_covariance, lift[:, 0]) + action_block(sigma[:, 0]),
-        jnp.where(followed, lift[:, 1:] @ slope, 0.0),
+        with_action(model.initial_covariance, lift[:, 0], sigma[:, 0]),
+        jnp.where(followed, lift[:, 1:] @ chain.slope[:, :-1], 0.0),
         jnp.where(followed[..., 0], offset, 0.0),
-        lifted(model.process_covariance, lift[:, 1:]) + action_block(sigma[:, 1:]),
+        with_action(noise[:, :-1], lift[:, 1:], sigma[:, 1:]),
         jnp.broadcast_to(jnp.eye(D), (n, D, D)),
         jnp.broadcast_to(R, (n, length, D, D)),
     )
@@ -170,7 +181,7 @@ def _affine_chains(
 
 @jax.jit
 def _filter(model: Model, policy: Any, sensor: GaussianSensor, chain: TruthChain) -> GaussianFiltered:
-    chains = _affine_chains(model, policy, sensor, chain.reported, chain.point)
+    chains = _affine_chains(model, policy, sensor, chain)
     reports = jnp.concatenate([chain.reported.observations, chain.reported.actions], -1)
     return lax.map(lambda x: filter_gaussian(*x), (chains, reports, chain.reported.live))
 
@@ -187,20 +198,37 @@ def _draw(key: Array, filtered: GaussianFiltered, draws: int) -> Float[Array, "M
 
 
 @jax.jit
-def _on_the_way(sensor: GaussianSensor, chain: TruthChain, means: Array) -> tuple[Array, Array]:
-    """Estimates ``STEPS`` of the way to the means, none beyond ``FURTHEST``; ``[len(STEPS), n, L, .]``."""
-    reported, point = chain.reported, chain.point
-    d = point.observations.shape[-1]
+def _axes(bounds: Bounds, sensor: GaussianSensor, chain: TruthChain) -> tuple[Array, Array, Array]:
+    """Centre, Cholesky factor, and the points of the differences ``[n, L, 1 + 2 D, D]``."""
+    reports = jnp.concatenate([chain.reported.observations, chain.reported.actions], -1)
+    radius = FURTHEST * jnp.sqrt(
+        jnp.concatenate([jnp.diagonal(sensor.state_covariance), jnp.diagonal(sensor.action_covariance)])
+    )
+    near = jnp.clip(chain.means, reports - radius, reports + radius)
+    centre = jnp.clip(near, bounds.low, bounds.high)[:, :, None]
+    widening = jnp.asarray(CAUTION)[jnp.minimum(chain.passes, len(CAUTION) - 1), 0]
+    spread = widening * chain.covariances
+    slack = 1e-14 * jnp.trace(spread, axis1=-2, axis2=-1)[..., None, None] * jnp.eye(spread.shape[-1])
+    factor = jnp.linalg.cholesky(spread + slack)
+    axes = _REACH * factor.swapaxes(-1, -2)
+    return centre[:, :, 0], factor, jnp.concatenate([centre, centre + axes, centre - axes], 2)
 
-    def towards(now: Array, mean: Array, report: Array, covariance: Array) -> Array:
-        radius = FURTHEST * jnp.sqrt(jnp.diagonal(covariance))
-        shares = jnp.asarray(STEPS)[:, None, None, None]
-        moved = jnp.clip(now + shares * (mean - now), report - radius, report + radius)
-        return jnp.where(reported.live[..., None], moved, now)
 
-    return (
-        towards(point.observations, means[..., :d], reported.observations, sensor.state_covariance),
-        towards(point.actions, means[..., d:], reported.actions, sensor.action_covariance),
+@jax.jit
+def _across(chain: TruthChain, centre: Array, factor: Array, values: Float[Array, "n L P d"]) -> TruthChain:
+    """The affine function through the values at the points of :func:`_axes`."""
+    D = centre.shape[-1]
+    middle, up, down = values[:, :, 0], values[:, :, 1 : D + 1], values[:, :, D + 1 :]
+    by_axis = (up - down) / (2 * _REACH)
+    bend = up + down - 2 * middle[:, :, None]
+    count = jnp.asarray(CAUTION)[jnp.minimum(chain.passes, len(CAUTION) - 1), 1]
+    weight = count * (_REACH**2 - 1) / (4 * _REACH**4)
+    return chain._replace(
+        following=middle + bend.sum(2) / (2 * _REACH**2),
+        slope=solve_triangular(factor, by_axis, trans=1, lower=True).swapaxes(-1, -2),
+        centre=centre,
+        remainder=weight * jnp.einsum("ntai,ntaj->ntij", bend, bend),
+        passes=chain.passes + 1,
     )
 
 
@@ -229,113 +257,97 @@ def log_joint(
     )
 
 
-@jax.jit
-def _chosen(candidates: Array, best: Array, better: Array, now: Array) -> Array:
-    picked = jnp.take_along_axis(candidates, best.reshape(1, -1, *[1] * (now.ndim - 1)), 0)[0]
-    return jnp.where(better.reshape(-1, *[1] * (now.ndim - 1)), picked, now)
-
-
 class GaussianTruth(NamedTuple):
     """Smoothing and joint draws of the truth behind a recording; made by :func:`gaussian_truth`.
 
-    ``init(recording) -> chain``, ``refresh(chain, policy, key, sensor) -> (chain, truths)``. Chains persist:
-    the next refresh starts where the last one ended, so one relinearisation a refresh is enough in the long
-    run. ``resample`` draws anew under another policy or sensor without a relinearisation, in milliseconds
-    for a short chain whatever the dynamics.
+    ``init(recording, sensor) -> chain``, ``refresh(chain, policy, key, sensor) -> (chain, truths)``. Chains
+    persist: the next refresh goes on where the last one ended, so that after the first one a single pass will
+    do. ``resample`` draws anew, under another policy or sensor, without asking the dynamics.
     """
 
     dynamics: Any
     model: Model
+    bounds: Bounds
     draws: int
-    iterations: int
-    widths: tuple[float, ...]
 
-    def init(self, reported: Recording) -> TruthChain:
-        """Start at the reports. Raises ``ValueError`` where the sizes are not the model's."""
+    def init(self, reported: Recording, sensor: GaussianSensor) -> TruthChain:
+        """Start at the reports, as uncertain as the sensor is; nothing is linearised yet.
+
+        Raises ``ValueError`` where the sizes are not the model's.
+        """
         d = self.model.initial_mean.shape[0]
         if reported.actions.ndim != 3 or reported.observations.shape[-1] != d:
             raise ValueError(
                 f"expected observations [n, L, {d}] and actions [n, L, k], got "
                 f"{reported.observations.shape} and {reported.actions.shape}"
             )
-        s, a = reported.observations, reported.actions
-        return TruthChain(reported, self._linearised(reported, s, a, self._following(reported, s, a), 0))
+        k = reported.actions.shape[-1]
+        sensor = sensor.sized(d, k)
+        means = jnp.concatenate([reported.observations, reported.actions], -1)
+        n, length, D = means.shape
+        R = jax.scipy.linalg.block_diag(sensor.state_covariance, sensor.action_covariance)
+        return TruthChain(
+            reported,
+            means,
+            jnp.broadcast_to(R, (n, length, D, D)),
+            jnp.zeros((n, length, d)),
+            jnp.zeros((n, length, d, D)),
+            means,
+            jnp.zeros((n, length, d, d)),
+            jnp.zeros((), int),
+        )
 
     def refresh(
-        self, chain: TruthChain, policy: Any, key: Array, sensor: GaussianSensor
+        self, chain: TruthChain, policy: Any, key: Array, sensor: GaussianSensor, passes: int = 1
     ) -> tuple[TruthChain, Truths]:
-        """Improve the estimate by ``iterations`` relinearisations, then draw."""
-        for i in range(self.iterations):
-            s, a, following = self._improved(chain, policy, sensor, self._filtered(chain, policy, sensor))
-            chain = chain._replace(point=self._linearised(chain.reported, s, a, following, i))
-        return chain, self.resample(chain, policy, key, sensor)
+        """Draws ``[M, n, L, .]`` after so many passes: 5 or more at first, then one a call will do."""
+        sensor = self._sized(sensor, chain)
+        for _ in range(passes):
+            centre, factor, points = _axes(self.bounds, sensor, chain)
+            chain = _across(chain, centre, factor, self._next_states(chain.reported, points))
+            filtered = _filter(self.model, policy, sensor, chain)
+            smoothed = _smooth(filtered)
+            chain = chain._replace(means=smoothed.means, covariances=smoothed.covariances)
+        return chain, _bounded_truths(self.bounds, chain.reported, _draw(key, filtered, self.draws))
 
     def resample(self, chain: TruthChain, policy: Any, key: Array, sensor: GaussianSensor) -> Truths:
-        """Draws ``[M, n, L, .]`` with the dynamics as last linearised."""
-        filtered = self._filtered(chain, policy, sensor)
-        s, a, _ = self._improved(chain, policy, sensor, filtered)
-        return _centred(chain.reported, s, a, _smooth(filtered).means, _draw(key, filtered, self.draws))
+        """Draws with the dynamics as last linearised; one :meth:`refresh` must have gone before."""
+        filtered = _filter(self.model, policy, self._sized(sensor, chain), chain)
+        return _bounded_truths(self.bounds, chain.reported, _draw(key, filtered, self.draws))
 
     def posterior(self, chain: TruthChain, policy: Any, sensor: GaussianSensor) -> GaussianSmoothed:
-        """Moments of the pairs ``(s, a)``, ``[n, L, D]`` and so on, with the dynamics as last linearised."""
-        filtered = self._filtered(chain, policy, sensor)
-        s, a, _ = self._improved(chain, policy, sensor, filtered)
-        return _smooth(filtered)._replace(means=jnp.concatenate([s, a], -1))
+        """Moments of the pairs ``(s, a)``, with the dynamics as last linearised, and the log-likelihood."""
+        return _smooth(_filter(self.model, policy, self._sized(sensor, chain), chain))
 
-    def log_joint(self, chain: TruthChain, policy: Any, sensor: GaussianSensor) -> Float[Array, " n"]:
-        """Exact log-density of the estimate together with the reports, in nats."""
-        return log_joint(self.model, policy, self._sized(chain, sensor), chain.reported, *chain.point[:3])
+    def estimate(self, chain: TruthChain) -> tuple[Float[Array, "n L d"], Float[Array, "n L k"]]:
+        """Posterior means of states and actions, within the bounds."""
+        means = jnp.clip(chain.means, self.bounds.low, self.bounds.high)
+        d = chain.slope.shape[2]
+        return means[..., :d], means[..., d:]
 
-    def _sized(self, chain: TruthChain, sensor: GaussianSensor) -> GaussianSensor:
-        return sensor.sized(chain.point.observations.shape[-1], chain.point.actions.shape[-1])
+    def _sized(self, sensor: GaussianSensor, chain: TruthChain) -> GaussianSensor:
+        _, _, d, D = chain.slope.shape
+        return sensor.sized(d, D - d)
 
-    def _filtered(self, chain: TruthChain, policy: Any, sensor: GaussianSensor) -> GaussianFiltered:
-        return _filter(self.model, policy, self._sized(chain, sensor), chain)
-
-    def _improved(
-        self, chain: TruthChain, policy: Any, sensor: GaussianSensor, filtered: GaussianFiltered
-    ) -> tuple[Array, Array, Array]:
-        """The estimate as far towards the smoothed mean as the joint density is highest; it never falls."""
-        sensor = self._sized(chain, sensor)
-        now = log_joint(self.model, policy, sensor, chain.reported, *chain.point[:3])
-        s, a = _on_the_way(sensor, chain, _smooth(filtered).means)
-        f = self._following(chain.reported, s, a)
-        tried = jnp.nan_to_num(
-            log_joint(self.model, policy, sensor, chain.reported, s, a, f), nan=-jnp.inf, neginf=-jnp.inf
-        )
-        best = jnp.argmax(tried, 0)
-        better = jnp.max(tried, 0) > now
-        s, a, f = (_chosen(x, best, better, old) for x, old in zip((s, a, f), chain.point[:3], strict=True))
-        return s, a, f
-
-    def _following(self, reported: Recording, s: Array, a: Array) -> Array:
+    def _next_states(self, reported: Recording, points: Float[Array, "n L P D"]) -> Float[Array, "n L P d"]:
+        d = self.model.initial_mean.shape[0]
         if isinstance(self.dynamics, JaxDynamics):
-            flat = self.dynamics.next_state(s.reshape(-1, s.shape[-1]), a.reshape(-1, a.shape[-1]))
-            return flat.reshape(s.shape)
+            flat = points.reshape(-1, points.shape[-1])
+            return self.dynamics.next_state(flat[:, :d], flat[:, d:]).reshape(*points.shape[:-1], d)
         # Simulators are asked only about steps that exist.
-        following = np.array(s)
-        there = np.broadcast_to(np.asarray(reported.followed), s.shape[:-1])
-        following[there] = self.dynamics.next_state(following[there], np.asarray(a)[there])
+        there, host = np.asarray(reported.followed), np.asarray(points)
+        flat = host[there].reshape(-1, host.shape[-1])
+        following = np.zeros((*host.shape[:-1], d))
+        following[there] = self.dynamics.next_state(flat[:, :d], flat[:, d:]).reshape(-1, host.shape[2], d)
         return jnp.asarray(following)
-
-    def _linearised(self, reported: Recording, s: Array, a: Array, following: Array, i: int) -> Point:
-        (n, length, d), k = s.shape, a.shape[-1]
-        if isinstance(self.dynamics, JaxDynamics):
-            A, B = self.dynamics.jacobians(s.reshape(-1, d), a.reshape(-1, k))
-            return Point(s, a, following, A.reshape(n, length, d, d), B.reshape(n, length, d, k))
-        width = self.widths[min(i, len(self.widths) - 1) :][:1]
-        A, B = np.zeros((n, length, d, d)), np.zeros((n, length, d, k))
-        there = np.asarray(reported.followed)
-        A[there], B[there] = self.dynamics.jacobians(np.asarray(s)[there], np.asarray(a)[there], *width)
-        return Point(s, a, following, jnp.asarray(A), jnp.asarray(B))
 
 
 @jax.jit
-def _centred(reported: Recording, s: Array, a: Array, means: Array, drawn: Array) -> Truths:
-    """Draws moved from the smoothed mean to the estimate, which differ where the dynamics bend."""
-    d = s.shape[-1]
-    spread = jnp.where(reported.live[..., None], drawn - means, 0.0)
-    return truths(reported, s + spread[..., :d], a + spread[..., d:])
+def _bounded_truths(bounds: Bounds, reported: Recording, drawn: Float[Array, "M n L D"]) -> Truths:
+    d = reported.observations.shape[-1]
+    reports = jnp.concatenate([reported.observations, reported.actions], -1)
+    drawn = jnp.where(reported.live[..., None], jnp.clip(drawn, bounds.low, bounds.high), reports)
+    return truths(reported, drawn[..., :d], drawn[..., d:])
 
 
 def gaussian_truth(
@@ -345,38 +357,49 @@ def gaussian_truth(
     process_covariance: ArrayLike = 1e-4,
     initial_mean: ArrayLike | None = None,
     initial_covariance: ArrayLike = 100.0,
+    observation_bounds: tuple[ArrayLike, ArrayLike] | None = None,
+    action_bounds: tuple[ArrayLike, ArrayLike] | None = None,
     draws: int = 4,
-    iterations: int = 3,
-    widths: tuple[float, ...] = (),
 ) -> GaussianTruth:
     """The truth under given dynamics.
 
     Parameters
     ----------
     dynamics : Dynamics
+        Only ``next_state`` is used.
     observation_size : int, ``d``
     process_covariance : number, ``[d]`` or ``[d, d]``
         ``Q``: how far a step may be from what the dynamics say.
     initial_mean, initial_covariance : ``[d]`` (zeros by default); number, ``[d]`` or ``[d, d]``
+    observation_bounds, action_bounds : pairs of ``[d]`` and of ``[k]``, or None
+        Between which the truth lies: estimates and draws are cut to them. Both or neither.
     draws : int, ``M``
-    iterations : int
-        Relinearisations a refresh.
-    widths : floats
-        Half-widths of the differences from which a simulator takes its slopes (a third argument of its
-        ``jacobians``), iteration by iteration, the last one from then on; empty leaves it to the simulator.
-        Where contacts make the dynamics jump, wide differences first and narrower ones later go much further.
 
     Raises
     ------
     ValueError
-        For covariances that are none or of another size, and counts below one.
+        For covariances that are none or of another size, bounds out of order, and no draws.
     """
-    if draws < 1 or iterations < 1:
-        raise ValueError(f"draws and iterations must be at least 1, got {draws} and {iterations}")
+    if draws < 1:
+        raise ValueError(f"draws must be at least 1, got {draws}")
+    if (observation_bounds is None) != (action_bounds is None):
+        raise ValueError(
+            "give bounds of both observations and actions, or of neither (infinite ones are fine)"
+        )
     d = observation_size
     mean = jnp.zeros(d) if initial_mean is None else jnp.asarray(initial_mean, float)
     if mean.shape != (d,):
         raise ValueError(f"initial_mean must have shape [{d}], got {mean.shape}")
+    low, high = jnp.asarray(-jnp.inf), jnp.asarray(jnp.inf)
+    if observation_bounds is not None and action_bounds is not None:
+        low, high = (
+            jnp.concatenate(
+                [jnp.broadcast_to(jnp.asarray(s, float), (d,)), jnp.asarray(a, float).reshape(-1)]
+            )
+            for s, a in zip(observation_bounds, action_bounds, strict=True)
+        )
+        if low.shape != high.shape or not (low < high).all():
+            raise ValueError(f"lower bounds must be below upper ones, got {low} and {high}")
 
     def matrix(whose: str, given: ArrayLike) -> Array:
         return covariance_matrix(whose, checked_covariance(whose, given), d)
@@ -384,9 +407,8 @@ def gaussian_truth(
     return GaussianTruth(
         dynamics,
         Model(matrix("process", process_covariance), mean, matrix("initial", initial_covariance)),
+        Bounds(low, high),
         draws,
-        iterations,
-        tuple(widths),
     )
 
 
