@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
@@ -29,7 +29,7 @@ class ConfusionNoise(Protocol):
     def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
         """Which of them turned each truth into its report (flat indices)."""
 
-    def _replace(self, **fields: Array) -> ConfusionNoise:
+    def _replace(self, *, noise: Array = ...) -> Any:
         """Itself with another ``noise``."""
 
 

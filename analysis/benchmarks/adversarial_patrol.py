@@ -1,0 +1,363 @@
+"""AIRL on patrol through reports that err, and GAIL on patrol through a view that hides (7.4.3 and 7.4.1).
+
+``python -m i2rl.analysis.benchmarks.adversarial_patrol`` writes ``build/bench/adversarial_patrol.json``:
+
+- *noise*: instance 2, its greedy expert (the dissertation's is a rule by hand), trajectories of 8 pairs from
+  anywhere, sessions of 32 to 128 pairs. Moving forward is reported as turning left, and turning right as
+  moving forward; states are never wrong. LBA after every session of AIRL on the truth, of AIRL and
+  robust-AIRL on the reports, with the sensor given or learned, and of LME-I2RL on the same reports, which
+  knows the six features that the expert's reward is made of. AIRL learners with and without memory of
+  earlier sessions. How often each final policy leads past the patrollers unseen.
+- *view*: the same patrol, sessions of one trajectory of 5 pairs for each patroller, at three degrees of
+  observability; online GAIL on what was seen, GAIL on the posterior of what was hidden too, and LME-I2RL.
+
+Parts and methods that the file already holds are not measured again.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from scipy import stats
+
+from ...domains.breach_trials import breach_trials
+from ...domains.patrol import FORWARD, LEFT, RIGHT, Patrol, demonstrate, instance
+from ...inference.adversarial_tabular import (
+    airl_tabular,
+    gail_tabular,
+    gibbs_airl_tabular,
+    robust_airl_tabular,
+    robust_airl_with_learned_sensor,
+    robust_gail_tabular,
+)
+from ...inference.lme import lme_i2rl
+from ...inference.session import Learner, run_streams
+from ...models.confusions import Confusions
+from ...models.demonstration import PAD, UNKNOWN, Demonstration
+from ...models.evidence import Sensor, observe
+from ...models.planning import deterministic_policy, hard_plan, reward_of, simulate
+from ..metrics import optimal_actions, policy_accuracy
+from .harness import DEFAULT_FOLDER, machine, print_table, seconds
+
+STEPS, LEAST, MOST = 8, 4, 16
+LEVELS = (0.05, 0.1, 0.2, 0.3)
+ASSUMED = 0.15
+CLEAN, NOISY, ROBUST, LEARNED, LME, GIBBS, LOGITS = (
+    "AIRL, clean input", "AIRL, noisy input", "robust-AIRL", "robust-AIRL, sensor learned", "LME-I2RL",
+    "robust-AIRL, Gibbs", "robust-AIRL, average of logits",
+)  # fmt: skip
+LAST = 15
+# Of those tried, the best for GAIL in a full view.
+GAIL_OPTIONS: dict[str, Any] = {"occupancy": "discounted"}
+GAIL, ROBUST_GAIL = "online GAIL", "GAIL, hidden steps in expectation"
+VIEWS = (100, 70, 30)
+WINDOW = 5
+
+
+class Streams(NamedTuple):
+    """The same sessions as they happened and as they were reported, ``[R, T, n, L]``; ``pairs [T]`` seen."""
+
+    truth: Demonstration
+    seen: Demonstration
+    sensor: Sensor
+    confusions: Confusions
+    pairs: Int[np.ndarray, " T"]
+
+
+def confusions_of(patrol: Patrol, forward_as_left: float, right_as_forward: float) -> Confusions:
+    """The two confusions of section 7.4.3."""
+    kinds = [(FORWARD, LEFT), (RIGHT, FORWARD)]
+    chances = np.array([forward_as_left, right_as_forward])
+    return Confusions.of_actions(patrol.mdp.n_states, kinds, chances, patrol.mdp.n_actions)
+
+
+def noisy_streams(patrol: Patrol, level: float, runs: int, sessions: int, seed: int = 0) -> Streams:
+    """Reports of the patroller's greedy expert; the truth is the same at every level."""
+    confusions = confusions_of(patrol, level, level)
+    sensor = Sensor(None, confusions.reading)
+    log_policy = jnp.log(jnp.asarray(patrol.expert_policy()))
+
+    def one(key: Array) -> tuple[Array, Array, Array]:
+        act, look = jax.random.split(key)
+        states, actions = simulate(act, patrol.mdp, log_policy, STEPS)
+        return states, actions, observe(look, sensor, states, actions)
+
+    keys = jax.random.split(jax.random.key(seed), runs * sessions * MOST)
+    states, actions, codes = jax.jit(partial(jax.lax.map, one, batch_size=64))(keys)
+    # Sizes are those of all runs, so that curves share their axis.
+    sizes = np.random.default_rng(seed).integers(LEAST, MOST + 1, sessions)
+    there = np.broadcast_to((np.arange(MOST) < sizes[:, None])[..., None], (runs, sessions, MOST, STEPS))
+
+    def shaped(demonstration: Demonstration) -> Demonstration:
+        arrays = (np.asarray(x).reshape(there.shape) for x in demonstration)
+        fills = (PAD, UNKNOWN, UNKNOWN, np.nan)
+        return Demonstration(
+            *(np.where(there, x, f).astype(x.dtype) for x, f in zip(arrays, fills, strict=True))
+        )
+
+    truth = shaped(Demonstration.from_pairs(np.asarray(states), np.asarray(actions)))
+    seen = shaped(Demonstration.from_codes(np.asarray(codes)))
+    return Streams(truth, seen, sensor, confusions, np.cumsum(sizes) * STEPS)
+
+
+def view_streams(patrol: Patrol, view: int, runs: int, sessions: int, seed: int = 0) -> Demonstration:
+    """Windows of both patrollers of each run, ``[runs * patrollers, sessions, 1, WINDOW]``."""
+    keys = jax.random.split(jax.random.key(seed), runs)
+    rows = [d for key in keys for d in demonstrate(key, patrol, view, sessions, WINDOW)]
+    return Demonstration(
+        *(np.stack([np.asarray(x)[:, None] for x in parts]) for parts in zip(*rows, strict=True))
+    )
+
+
+class Outcome(NamedTuple):
+    """One learner on all streams.
+
+    Fields
+    ------
+    accuracy : float ``[R, T]``, LBA over all states of the learned policy's likeliest actions
+    policies : float ``[R, S, A]``, the final ones, deterministic
+    noise : float ``[R, M]``, learned probabilities of confusions
+    seconds : float, compilation included
+    """
+
+    accuracy: Float[np.ndarray, "R T"]
+    policies: Float[np.ndarray, "R S A"]
+    noise: Float[np.ndarray, "R M"]
+    seconds: float
+
+
+def outcome_of(patrol: Patrol, learner: Learner, streams: Demonstration, seed: int = 1) -> Outcome:
+    """Run a learner over all streams, one after another, judged after every session."""
+    mdp = patrol.mdp
+    optimal = optimal_actions(mdp, jnp.asarray(patrol.weights))
+
+    def policy_of(state: Any) -> Float[Array, "S A"]:
+        if hasattr(state, "log_policy"):
+            return jax.nn.one_hot(jnp.argmax(state.log_policy, axis=1), mdp.n_actions)
+        return deterministic_policy(hard_plan(mdp, reward_of(mdp, state.weights)).optimal)
+
+    def judged(state: Any, report: Any) -> tuple:
+        accuracy = policy_accuracy(mdp, optimal, policy_of(state)).overall
+        return accuracy, getattr(report, "noise", jnp.zeros(0))
+
+    results: list[Any] = []
+
+    def run() -> None:
+        results.append(jax.block_until_ready(run_streams(learner, jax.random.key(seed), streams, judged)))
+
+    took = seconds(run)
+    states, (accuracy, noise) = results[0]
+    policies = jax.lax.map(policy_of, states)
+    return Outcome(np.asarray(accuracy), np.asarray(policies), np.asarray(noise)[:, -1], took)
+
+
+def interval(values: Float[np.ndarray, "R ..."]) -> tuple[np.ndarray, np.ndarray]:
+    """Mean over runs, and half the width of its 95 % interval (Student)."""
+    n = len(values)
+    half = stats.t.ppf(0.975, n - 1) * values.std(0, ddof=1) / np.sqrt(n) if n > 1 else 0 * values[0]
+    return values.mean(0), half
+
+
+def success_rates(
+    patrol: Patrol, policies: Float[np.ndarray, "R S A"], trials: int, seed: int = 2
+) -> Float[np.ndarray, " R"]:
+    """Share of breaches that reach the goal unseen, with each run's policy for both patrollers.
+
+    Everything is in view and read rightly while the learner waits: what differs is the policy alone.
+    """
+    rates = []
+    for i, policy in enumerate(policies):
+        both = jnp.broadcast_to(jnp.log(jnp.asarray(policy)), (patrol.patrollers, *policy.shape))
+        outcome = breach_trials(
+            jax.random.fold_in(jax.random.key(seed), i), patrol, both, observability=100,
+            observed_steps=STEPS, trials=trials,
+        )  # fmt: skip
+        rates.append(outcome.rate())
+    return np.array(rates)
+
+
+# -- studies ------------------------------------------------------------------------------------------
+
+
+class _File:
+    """Results as they come: what is there is not measured again."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.results: dict[str, Any] = json.loads(path.read_text()) if path.exists() else {}
+
+    def measure(self, part: str, name: str, action: Callable[[], Mapping[str, Any]]) -> None:
+        known = self.results.setdefault(part, {})
+        if name not in known:
+            known[name] = {"machine": machine(), **action()}
+            self.path.parent.mkdir(parents=True, exist_ok=True)
+            self.path.write_text(json.dumps(self.results) + "\n")
+            print(part, name, {k: v for k, v in known[name].items() if np.ndim(v) == 0}, flush=True)
+
+
+def noise_methods(
+    streams: Streams, patrol: Patrol
+) -> dict[str, tuple[Callable[..., Learner], Demonstration]]:
+    """Learners (given options) and what each sees."""
+    mdp = patrol.mdp
+    assumed = confusions_of(patrol, ASSUMED, ASSUMED)
+    return {
+        CLEAN: (partial(airl_tabular, mdp), streams.truth),
+        NOISY: (partial(airl_tabular, mdp), streams.seen),
+        ROBUST: (partial(robust_airl_tabular, mdp, streams.sensor), streams.seen),
+        LEARNED: (partial(robust_airl_with_learned_sensor, mdp, assumed), streams.seen),
+        GIBBS: (partial(gibbs_airl_tabular, mdp, streams.sensor, draws=10, burn_in=10), streams.seen),
+        LOGITS: (partial(robust_airl_tabular, mdp, streams.sensor, average="logits"), streams.seen),
+        LME: (lambda **_: lme_i2rl(mdp, streams.sensor), streams.seen),
+    }
+
+
+def noise_study(
+    file: _File,
+    *,
+    runs: int,
+    few: int,
+    sessions: int,
+    trials: int,
+    levels: Sequence[float],
+    rounds: int,
+) -> None:
+    """Every method at the first level; at the others, on ``few`` runs, what shows the cost of noise.
+
+    AIRL learners with and without memory of earlier sessions.
+    """
+    patrol = instance(2)
+    variants = [
+        (CLEAN, 0.0), (NOISY, 0.0), (ROBUST, 0.0), (CLEAN, 1.0), (NOISY, 1.0), (ROBUST, 1.0), (LME, 1.0),
+        (LEARNED, 1.0), (LEARNED, 0.0), (LOGITS, 0.0), (GIBBS, 0.0),
+    ]  # fmt: skip
+    for level in levels:
+        first = level == levels[0]
+        streams = noisy_streams(patrol, level, runs, sessions)
+        methods = noise_methods(streams, patrol)
+        for name, memory in variants if first else [v for v in variants if v[0] in (NOISY, ROBUST)]:
+            count = runs if first and name not in (GIBBS, LOGITS) else min(few, runs)
+            tried = trials if count == runs and first else 0
+            make, seen = methods[name]
+            own = Demonstration(*(x[:count] for x in seen))
+            learner = make(memory=memory, rounds=rounds)
+
+            def action(
+                name: str = name,
+                memory: float = memory,
+                level: float = level,
+                learner: Learner = learner,
+                own: Demonstration = own,
+                tried: int = tried,
+                pairs: np.ndarray = streams.pairs,
+            ) -> dict[str, Any]:
+                found = outcome_of(patrol, learner, own)
+                success = success_rates(patrol, found.policies, tried) if tried else np.zeros(0)
+                return {
+                    "name": name, "level": level, "memory": memory, "seconds": found.seconds,
+                    "final": float(found.accuracy[:, -LAST:].mean()), "trials": tried,
+                    "success mean": float(success.mean()) if tried else None,
+                    "pairs": pairs.tolist(), "accuracy": found.accuracy.round(5).tolist(),
+                    "success": success.tolist(), "noise": found.noise.round(5).tolist(),
+                }  # fmt: skip
+
+            file.measure("noise", f"{name}, {level:g}, memory {memory:g}", action)
+    true = np.broadcast_to(patrol.expert_policy(), (runs, *patrol.expert_policy().shape))
+
+    def with_the_true_policy() -> dict[str, Any]:
+        success = success_rates(patrol, true, trials)
+        return {"success": success.tolist(), "success mean": float(success.mean()), "trials": trials}
+
+    file.measure("noise", "true policy", with_the_true_policy)
+
+
+def view_study(file: _File, *, runs: int, sessions: int, rounds: int) -> None:
+    """GAIL and LME-I2RL at three degrees of observability."""
+    patrol = instance(2)
+    mdp = patrol.mdp
+    options: dict[str, Any] = {"rounds": rounds, "updates": 5, "horizon": 8, **GAIL_OPTIONS}
+    for view in VIEWS:
+        seen = view_streams(patrol, view, runs, sessions)
+        visibility = patrol.visibility(view)
+        learners = [
+            (LME, 1.0, lme_i2rl(mdp, visibility)),
+            (GAIL, 0.0, gail_tabular(mdp, memory=0.0, **options)),
+            (GAIL, 1.0, gail_tabular(mdp, memory=1.0, **options)),
+            (ROBUST_GAIL, 1.0, robust_gail_tabular(mdp, visibility, memory=1.0, **options)),
+        ]
+        for name, memory, learner in learners:
+
+            def action(
+                name: str = name,
+                memory: float = memory,
+                view: int = view,
+                learner: Learner = learner,
+                seen: Demonstration = seen,
+            ) -> dict[str, Any]:
+                found = outcome_of(patrol, learner, seen)
+                return {
+                    "name": name, "view": view, "memory": memory, "seconds": found.seconds,
+                    "final": float(found.accuracy[:, -1].mean()),
+                    "accuracy": found.accuracy.round(5).tolist(),
+                }  # fmt: skip
+
+            file.measure("view", f"{name}, {view} %, memory {memory:g}", action)
+
+
+def _print(results: Mapping[str, Any]) -> None:
+    rows: list[tuple[Any, ...]] = []
+    for key, r in results.get("noise", {}).items():
+        if "accuracy" not in r:
+            continue
+        final, half = interval(np.array(r["accuracy"])[:, -LAST:].mean(1))
+        breach: tuple[str, str] = ("-", "-")
+        if r["success"]:
+            mean, spread = interval(np.array(r["success"]))
+            breach = (f"{mean:.3f}", f"{spread:.3f}")
+        rows.append((key, len(r["accuracy"]), float(final), float(half), *breach))
+    print_table(
+        "Reports that err: LBA, mean of the last 15 sessions; breaches that succeed",
+        ("method, noise", "runs", "LBA", "+-", "success", "+-"), rows,
+    )  # fmt: skip
+    rows = []
+    for key, r in results.get("view", {}).items():
+        mean, half = interval(np.array(r["accuracy"])[:, -1])
+        rows.append((key, len(r["accuracy"]), float(mean), float(half)))
+    print_table("Hidden steps: LBA after the last session", ("method, view", "streams", "LBA", "+-"), rows)
+
+
+def main() -> None:
+    """Measure, print and write."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
+    parser.add_argument("--part", choices=("noise", "view", "all"), default="all")
+    parser.add_argument("--runs", type=int, default=20)
+    parser.add_argument("--few", type=int, default=8, help="runs of other levels, and of slow variants")
+    parser.add_argument("--sessions", type=int, default=35)
+    parser.add_argument("--view-sessions", type=int, default=100)
+    parser.add_argument("--trials", type=int, default=40)
+    parser.add_argument("--rounds", type=int, default=30)
+    parser.add_argument("--levels", type=float, nargs="+", default=LEVELS)
+    parser.add_argument("--out", type=Path, default=DEFAULT_FOLDER / "adversarial_patrol.json")
+    given = parser.parse_args()
+    file = _File(given.out)
+    if given.part != "view":
+        noise_study(
+            file, runs=given.runs, few=given.few, sessions=given.sessions, trials=given.trials,
+            levels=given.levels, rounds=given.rounds,
+        )  # fmt: skip
+    if given.part != "noise":
+        view_study(file, runs=max(given.runs // 4, 1), sessions=given.view_sessions, rounds=given.rounds)
+    _print(file.results)
+
+
+if __name__ == "__main__":
+    main()
