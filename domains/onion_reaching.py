@@ -225,9 +225,12 @@ class OnionMover(NamedTuple):
     Fields
     ------
     stride : float, metres of an action of 1, as the environment's
+    looking : float in [0, 1), the chance of a drawn action before the eyes to go on looking. Then the next
+        action has two modes; at 0 a normal policy can follow it
     """
 
     stride: Any = STRIDE
+    looking: Any = _LOOKING_ON
 
     @property
     def actions(self) -> ActionSpace:
@@ -246,7 +249,7 @@ class OnionMover(NamedTuple):
         batch, dtype = way.shape[:-1], way.dtype
         wobble = jnp.asarray(_WOBBLE, dtype) * jax.random.normal(k_wobble, way.shape, dtype)
         about = jnp.asarray(_LOOK, dtype) + wobble - observations[..., 6:9]
-        stays = looking & jax.random.bernoulli(k_look, _LOOKING_ON, batch)
+        stays = looking & jax.random.bernoulli(k_look, self.looking, batch)
         longest = jax.random.uniform(k_length, batch, dtype, 0.4, 1.2)[..., None] * _LONGEST
         unsteady = _UNSTEADY * jax.random.normal(k_unsteady, way.shape, dtype)
         moved = self._limited(way, longest)
@@ -291,6 +294,8 @@ def _way(observations: Float[Array, "... 29"]) -> tuple[Float[Array, "... 3"], B
     return which(waiting.any(-1), target - wrist, jnp.zeros_like(wrist)), looking
 
 
-def demonstrate_onions(key: Array, n: int, stride: float = STRIDE) -> Trajectories:
+def demonstrate_onions(
+    key: Array, n: int, stride: float = STRIDE, looking: float = _LOOKING_ON
+) -> Trajectories:
     """``n`` synthetic recordings: actions drawn from the mover in :func:`onion_reaching` of this stride."""
-    return simulate(onion_reaching(stride), OnionMover(stride), key, n)
+    return simulate(onion_reaching(stride), OnionMover(stride, looking), key, n)

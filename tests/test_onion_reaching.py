@@ -179,8 +179,12 @@ def test_the_dynamics_have_derivatives(sorted_belts):
 
 
 def test_the_mover_never_errs(sorted_belts):
-    assert sorted_belts.terminated.all()
-    np.testing.assert_allclose(sorted_belts.returns, 5 - 0.001 * sorted_belts.live.sum(1), atol=1e-5)
+    hasty = demonstrate_onions(KEY, 200, looking=0.0)
+    for found in (sorted_belts, hasty):
+        assert found.terminated.all()
+        np.testing.assert_allclose(found.returns, 5 - 0.001 * found.live.sum(1), atol=1e-5)
+    # Geometric pauses of 9 steps on average, five of them; some onions are passed along without any.
+    assert 25 < (sorted_belts.live.sum(1) - hasty.live.sum(1)).mean() < 45
 
 
 @pytest.mark.parametrize("stride", [STRIDE, 0.1])
