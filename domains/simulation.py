@@ -55,7 +55,7 @@ class Perturbed(_PerturbedFields):
         """Actions drawn."""
         k_own, k_any, k_which = jax.random.split(key, 3)
         space, batch = self.policy.actions, observations.shape[:-1]
-        anything = jax.random.bernoulli(k_which, self.share, batch)
+        anything = jax.random.bernoulli(k_which, jnp.asarray(self.share, float), batch)
         own = self.policy.sample(k_own, observations)
         if space.discrete:
             return jnp.where(anything, jax.random.randint(k_any, batch, 0, space.n), own)

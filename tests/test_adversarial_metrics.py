@@ -149,6 +149,8 @@ def test_a_perturbed_policy_does_anything_as_often_as_it_says():
     anything = (drawn < [1.0, 2.0]).any(1)
     assert abs(anything.mean() - 0.3) < 0.015
     assert stats.kstest(drawn[anything][:, 1], stats.uniform(-2, 4).cdf).pvalue > 1e-3
+    whole = np.asarray(Perturbed(still, 1).sample(KEY, seen[:100]))  # a share need not be a float
+    assert (whole < [1.0, 2.0]).any(1).all()
 
 
 def test_a_mix_says_whose_each_episode_is():
