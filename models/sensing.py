@@ -334,6 +334,28 @@ class ShiftSensor(NamedTuple):
         )
         return jnp.where(same, jnp.log(p), -jnp.inf)
 
+    def candidates(
+        self, reported_observations: Float[Array, "... d"], reported_actions: Array
+    ) -> tuple[Float[Array, "... 2 d"], Float[Array, "... 2"]]:
+        """Everything that may be behind a report, the report itself first, and what each makes of it.
+
+        Returns the truths and the log-probability, in nats, that each would be reported so.
+        """
+        back = self.displacement(reported_actions)
+        shifted = reported_observations.at[..., 0].add(-back)
+        p = jnp.asarray(self.probability, float)
+        log_p = jnp.broadcast_to(jnp.stack([jnp.log1p(-p), jnp.log(p)]), (*back.shape, 2))
+        return jnp.stack([reported_observations, shifted], -2), log_p
+
+
+class FiniteSensor(Protocol):
+    """A sensor behind each report of which there are finitely many truths; actions it reports as they are."""
+
+    def candidates(
+        self, reported_observations: Float[Array, "... d"], reported_actions: Array
+    ) -> tuple[Float[Array, "... K d"], Float[Array, "... K"]]:
+        """The truths, and the log-probability that each would be reported so."""
+
 
 class Truths(NamedTuple):
     """Draws of what may have happened behind a recording, ``M`` of them, usable as an expert's transitions.
