@@ -114,11 +114,12 @@ class NoisyRollout(NamedTuple):
     rollout: Rollout
     executed: Array
 
-    def steps(self, shown: str, actions: ActionSpace) -> Transitions:
-        """Transitions ``[T, n, ...]`` with the ``intended`` or the ``executed`` actions."""
+    def steps(self, shown: str) -> Transitions:
+        """Transitions ``[T, n, ...]`` with the ``intended`` or the ``executed`` actions, as drawn."""
         chosen = self.executed if shown == "executed" else self.rollout.actions
-        r = self.rollout
-        return Transitions(r.observations, actions.clip(chosen), r.next_observations, r.terminated)
+        return Transitions(
+            self.rollout.observations, chosen, self.rollout.next_observations, self.rollout.terminated
+        )
 
 
 def roll_out_noisily(
@@ -304,7 +305,7 @@ def noisy_airl(
 
     @jax.jit
     def rewarded(network: ShapedReward, policy: Policy, noisy: NoisyRollout) -> Float[Array, "T n"]:
-        return discriminator.rewards(network, policy, noisy.steps("intended", task.actions))
+        return discriminator.rewards(network, policy, _within(task.actions, noisy.steps("intended")))
 
     def init(key: Array) -> AdversarialState:
         k_network, k_agent, key = jax.random.split(key, 3)
@@ -332,8 +333,7 @@ def noisy_airl(
             key, k_collect, k_updates = jax.random.split(key, 3)
             before = acting.running
             acting, noisy = _acted(agent, acting, levels, k_collect)
-            steps = noisy.steps(how.shown, task.actions)
-            replay = _remembered(replay, steps, rounds % how.replay)
+            replay = _remembered(replay, noisy.steps(how.shown), rounds % how.replay)
             rounds += 1
             network, memory, last = trained(
                 network, memory, acting.policy, expert, replay, min(rounds, how.replay), k_updates
@@ -368,7 +368,7 @@ def noisy_airl(
         )
         return state, report
 
-    known = {"discriminator": discriminator.name, **settings._asdict(), **how._asdict()}
+    known = {"discriminator": discriminator.name, "agent": settings._asdict(), **how._asdict()}
     return Learner("noisy-AIRL", task, {**known, **dict(configuration or {})}, init, update)  # type: ignore[arg-type]
 
 
@@ -379,6 +379,10 @@ def _acted(
         agent.environment, state.policy, state.critic, state.running, levels, key, agent.settings.n_steps
     )
     return state._replace(running=running), noisy
+
+
+def _within(actions: ActionSpace, steps: Transitions) -> Transitions:
+    return steps._replace(actions=actions.clip(steps.actions))
 
 
 def _discriminator_updates(
@@ -416,7 +420,9 @@ def _discriminator_updates(
         def step(carry: tuple, key: Array) -> tuple:
             parameters, memory = carry
             ours, theirs, at = drawn(key)
+            # Weights are of the action as drawn: beyond the bounds it cannot have been a random one.
             weights = importance_weights(policy, theirs.observations, theirs.actions, at)
+            theirs = _within(network.actions, theirs)
 
             def objective(parameters: tuple) -> tuple[Array, Losses]:
                 net = _with(network, parameters)

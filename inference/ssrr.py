@@ -167,12 +167,12 @@ def rank(
 @jax.jit
 def _scored(network: ShapedReward, noisy: NoisyRollout) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
     """Of the first episode in each environment, its summed rewards and its length."""
-    steps = noisy.steps("executed", network.actions)
+    steps = noisy.steps("executed")
     done = noisy.rollout.terminated | noisy.rollout.truncated
     live = jnp.cumsum(done, 0) - done == 0
     lengths = live.sum(0)
     left = jnp.where((live & steps.terminated).any(0), len(live) - lengths, 0)
-    earned = jnp.where(live, network(steps.observations, steps.actions), 0).sum(0)
+    earned = jnp.where(live, network(steps.observations, network.actions.clip(steps.actions)), 0).sum(0)
     return earned + left * network.absorbing, lengths
 
 
