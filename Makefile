@@ -44,6 +44,7 @@ bench: $(READY)
 
 bench-peers: $(READY) $(PEERS)/.installed
 	$(BIN)/python -m i2rl.analysis.benchmarks.peers --peer-python $(PEERS)/bin/python
+	$(BIN)/python -m i2rl.analysis.benchmarks.ppo_peer --peer-python $(PEERS)/bin/python
 
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "i2rl needs Python 3.11 or later: make PYTHON=python3.11 ...")'
@@ -53,10 +54,11 @@ $(READY): requirements.lock pyproject.toml
 	@touch $@
 
 # The peer needs its own environment: it pins old versions, and its tools need an old setuptools.
-$(PEERS)/.installed:
+$(PEERS)/.installed: Makefile
 	$(PYTHON) -m venv $(PEERS)
 	$(PEERS)/bin/pip install --quiet --disable-pip-version-check torch==2.13.0
 	$(PEERS)/bin/pip install --quiet --disable-pip-version-check imitation==1.0.1 "setuptools<81"
+	$(PEERS)/bin/pip install --quiet --disable-pip-version-check "gymnasium[mujoco]==0.29.1" mujoco==4.0.0
 	@touch $@
 
 clean:

@@ -1,7 +1,11 @@
 """What is learned from: patrols and their breach, onion sorting, object worlds, a mouse in a labyrinth.
 
-Importing it registers them with Gymnasium; see :mod:`i2rl.domains.environments`.
+Importing it registers them with Gymnasium; see :mod:`i2rl.domains.environments`. Names of tasks for networks
+are imported when they are first used: they need the extra ``adversarial``.
 """
+
+import importlib
+from typing import Any
 
 from .breach_environment import BreachEnv
 from .breach_trials import BreachOutcome, breach_trials, greedy_policies, random_policies, soft_policies
@@ -37,6 +41,8 @@ from .sorting import (
 from .sorting_line import Line, Tally, sort_belts
 from .swap_noise import SwapNoise
 
+_HOMES = {"control": ("cart_pole", "mountain_car")}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 __all__ = [
     "Bout",
     "BreachEnv",
@@ -78,4 +84,11 @@ __all__ = [
     "sorting_without_claiming",
     "walled_world",
     "without_blocked_moves",
+    *_HOME_OF,
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".{_HOME_OF[name]}", __name__), name)

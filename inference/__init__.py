@@ -62,6 +62,7 @@ _HOMES = {
     "observation_printed": ("solve_printed_program",),
     "perception": ("WithTruth",),
     "policy_walk": ("birl",),
+    "ppo": ("PPO", "PPOState"),
     "minmax": ("MinMaxProgram", "MinMaxSolution"),
     "minmax_printed": (
         "TrajectorySpace",
@@ -74,6 +75,7 @@ _HOMES = {
     "mixture_problem": ("label_invariant",),
     "posterior": ("sample_posterior",),
     "robust": ("RIMEOReport", "RIMEOState", "rifom", "rimeo", "robust_irl"),
+    "rollouts": ("Episodes", "finished_returns", "play"),
     "schedule": ("Harmonic",),
     "session": (
         "Fleet",

@@ -57,6 +57,7 @@ def main() -> None:
         agent.learn(request["steps"])
         seconds, processor_seconds = time.perf_counter() - began, time.process_time() - processor_began
         training = np.concatenate(tasks.env_method("get_episode_rewards"))
+        latest = [episode["r"] for episode in agent.ep_info_buffer]  # a hundred
         environments.training = environments.norm_reward = False
         returns, _ = evaluate_policy(
             agent, environments, request["episodes"], deterministic=True, return_episode_rewards=True
@@ -64,6 +65,7 @@ def main() -> None:
         answer = {
             "return": float(np.mean(returns)),
             "training_return": float(np.mean(training)),
+            "latest_return": float(np.mean(latest)),
             "steps": agent.num_timesteps,
             "seconds": seconds,
             "processor_seconds": processor_seconds,
