@@ -263,47 +263,48 @@ _KINDS = {
 
 def store_results(results: AdversarialResults, path: Path | str) -> None:
     """Write results as JSON that :func:`load_results` reads."""
-    Path(path).write_text(json.dumps(_plain(results), allow_nan=False) + "\n")
+    Path(path).write_text(json.dumps(plain(results), allow_nan=False) + "\n")
 
 
 def load_results(path: Path | str) -> AdversarialResults:
     """Read what :func:`store_results` wrote; ``ValueError`` for a file of something else."""
-    found = _rebuilt(json.loads(Path(path).read_text()))
+    found = rebuilt(json.loads(Path(path).read_text()))
     if not isinstance(found, AdversarialResults):
         raise ValueError(f"{path} does not hold the results of adversarial learners")
     return found
 
 
-def _plain(value: Any) -> Any:
-    """JSON has no arrays, named tuples, or numbers that are not finite."""
+def plain(value: Any) -> Any:
+    """As JSON, which has no arrays, named tuples, or numbers that are not finite."""
     if type(value).__name__ in _KINDS:
-        return {"kind": type(value).__name__, **{k: _plain(v) for k, v in value._asdict().items()}}
+        return {"kind": type(value).__name__, **{k: plain(v) for k, v in value._asdict().items()}}
     if isinstance(value, Mapping):
-        return {"items": [[k, _plain(v)] for k, v in value.items()]}
+        return {"items": [[k, plain(v)] for k, v in value.items()]}
     if isinstance(value, np.ndarray) or hasattr(value, "__jax_array__") or isinstance(value, jax.Array):
         array = np.asarray(value)
-        return {"array": [_plain(x) for x in array.ravel().tolist()], "shape": list(array.shape)}
+        return {"array": [plain(x) for x in array.ravel().tolist()], "shape": list(array.shape)}
     if isinstance(value, tuple | list):
-        return [_plain(x) for x in value]
+        return [plain(x) for x in value]
     if isinstance(value, np.generic):
-        return _plain(value.item())
+        return plain(value.item())
     if isinstance(value, float) and not math.isfinite(value):
         return {"float": str(value)}
     return value
 
 
-def _rebuilt(value: Any) -> Any:
+def rebuilt(value: Any) -> Any:
+    """What :func:`plain` was given; lists come back as tuples, all arrays as NumPy's."""
     if isinstance(value, list):
-        return tuple(_rebuilt(x) for x in value)
+        return tuple(rebuilt(x) for x in value)
     if not isinstance(value, dict):
         return value
     if "items" in value:
-        return {k: _rebuilt(v) for k, v in value["items"]}
+        return {k: rebuilt(v) for k, v in value["items"]}
     if "array" in value:
-        return np.array(_rebuilt(value["array"])).reshape(value["shape"])
+        return np.array(rebuilt(value["array"])).reshape(value["shape"])
     if "float" in value:
         return float(value["float"])
     kind = _KINDS.get(value.get("kind", ""))
     if kind is None:
         raise ValueError(f"there is nothing of the kind {value.get('kind')!r} in results")
-    return kind(**{k: _rebuilt(v) for k, v in value.items() if k != "kind"})
+    return kind(**{k: rebuilt(v) for k, v in value.items() if k != "kind"})

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..models.environment import Environment, HostEnvironment
 from ..models.sensing import Recording
 
-LEVELS = (0.0, 0.25, 0.5, 0.75, 1.0)
+LEVELS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
 class Behaviour(Protocol):

@@ -23,15 +23,15 @@ from ..models.networks import Policy
 from ..models.sensing import GaussianSensor, Recording, Truths
 from .airl import Training, adversarial
 from .discriminator import Discriminator, ExpertTransitions, Transitions, airl_discriminator
-from .gaussian_truth import GaussianTruth, TruthChain, fitted_sensor, gaussian_truth
+from .gaussian_truth import GaussianTruth, fitted_sensor, gaussian_truth
 from .session import Learner
 
 
 class Look(NamedTuple):
-    """The chain, and the policy it was last looked at under."""
+    """The chain, and the policy it was last looked at under (None before the first look)."""
 
-    chain: TruthChain
-    policy: Policy
+    chain: Any
+    policy: Policy | None
 
 
 class Smoothed(NamedTuple):
@@ -39,30 +39,33 @@ class Smoothed(NamedTuple):
 
     Fields
     ------
-    truth : GaussianTruth, with the dynamics
-    sensor : GaussianSensor
+    truth : GaussianTruth, CandidateTruth or PartitionTruth, with the dynamics
+    sensor : the sensor it is about
+    passes : int
+        Relinearisations of the first look at a recording; later looks, which go on from it, make one.
     """
 
-    truth: GaussianTruth
-    sensor: GaussianSensor
+    truth: Any
+    sensor: Any
+    passes: int = 6
 
-    def prior(self) -> GaussianSensor:
+    def prior(self) -> Any:
         """The sensor."""
         return self.sensor
 
-    def begin(self, recording: Recording, sensor: GaussianSensor, key: Array) -> Look | TruthChain:
+    def begin(self, recording: Recording, sensor: Any, key: Array) -> Look:
         """Start at the reports. Raises ``ValueError`` where their sizes are not the dynamics'."""
-        return self.truth.init(recording)
+        return Look(self.truth.init(recording, sensor), None)
 
-    def refresh(
-        self, chain: Any, sensor: GaussianSensor, policy: Policy, key: Array
-    ) -> tuple[Look, ExpertTransitions]:
-        """Relinearise, smooth and draw under the policy."""
-        chain = chain.chain if isinstance(chain, Look) else chain
-        chain, drawn = self.truth.refresh(chain, policy, key, sensor)
-        return Look(chain, policy), as_expert(drawn)
+    def refresh(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
+        """Relinearise where there is something to, smooth, and draw under the policy."""
+        passes = (
+            (self.passes if chain.policy is None else 1,) if isinstance(self.truth, GaussianTruth) else ()
+        )
+        found, drawn = self.truth.refresh(chain.chain, policy, key, sensor, *passes)
+        return Look(found, policy), as_expert(drawn)
 
-    def learned(self, chain: Look, sensor: GaussianSensor) -> GaussianSensor:
+    def learned(self, chain: Look, sensor: Any) -> Any:
         """The sensor as it was."""
         return sensor
 
@@ -74,11 +77,13 @@ class SmoothedAndFitted(NamedTuple):
     ------
     truth : GaussianTruth
     sensor : GaussianSensor, what is believed before the first session
+    passes : int, as of :class:`Smoothed`
     steps : int, of expectation-maximisation a session
     """
 
     truth: GaussianTruth
     sensor: GaussianSensor
+    passes: int = 6
     steps: int = 4
 
     def prior(self) -> GaussianSensor:
@@ -124,8 +129,8 @@ def robust_airl(
 ) -> Learner:
     """robust-AIRL with a known sensor.
 
-    ``dynamics`` has ``next_state`` and ``jacobians`` (:class:`~i2rl.inference.gaussian_truth.Dynamics`), as
-    the robots of :mod:`i2rl.domains.locomotion` do; ``truth`` goes to :func:`gaussian_truth`.
+    ``dynamics`` has ``next_state`` (:class:`~i2rl.inference.gaussian_truth.Dynamics`), as the robots of
+    :mod:`i2rl.domains.locomotion` do; ``truth`` goes to :func:`gaussian_truth`.
     """
     return _learner("robust-AIRL", Smoothed, generator, sensor, dynamics, discriminator, training, truth)
 
