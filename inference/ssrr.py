@@ -179,27 +179,37 @@ def _scored(network: ShapedReward, noisy: NoisyRollout) -> tuple[Float[Array, " 
 # -- the learner ------------------------------------------------------------------------------------------
 
 
+STARTS = ("scratch", "first")
+
+
 class SSRRTraining(NamedTuple):
     """How a session trains, after noisy-AIRL.
 
     Fields
     ------
-    levels : probabilities of a random action at which the first policy is acted out, in increasing order
+    levels : probabilities of a random action at which the first policy is acted out, in increasing order.
+        Scores are scaled by the least: where a robot falls and the first reward, never asked before, plunges,
+        the highest levels leave no difference among the others (for Hopper the released end at 0.75)
     trajectories : int, episodes at each
     regression : Regression
     rounds : int, of the second policy, in a session
+    start : "scratch" (as released, who take a million steps and more) or "first", the second policy as it
+        begins: untrained, or a copy of the first as the first session leaves it
     """
 
     levels: Sequence[float] = tuple(0.05 * i for i in range(20))
     trajectories: int = 5
     regression: Regression = Regression()
     rounds: int = 10
+    start: str = "scratch"
 
     def checked(self) -> SSRRTraining:
         """Itself. Raises ``ValueError`` naming a field that cannot be."""
         for name in ("trajectories", "rounds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.start not in STARTS:
+            raise ValueError(f"the second policy starts from one of {', '.join(STARTS)}, got {self.start!r}")
         fit_noise_curve(np.array(self.levels), np.zeros(len(self.levels)))
         self.regression.checked()
         return self
@@ -316,6 +326,8 @@ def ssrr(
         )
         network, memory, fit = regress(state.network, state.optimiser, ranked, k_regress)
         acting, returns = state.generator, []
+        if how.start == "first" and state.session == 0:
+            acting = acting._replace(policy=imitation.generator.policy)
         for _ in range(how.rounds):
             before = acting.running
             acting, rollout = agent.collect(acting)

@@ -259,12 +259,33 @@ def test_a_run_resumed_from_its_journal_equals_an_uninterrupted_one_to_the_bit(
     assert all(bits(a) == bits(b) for a, b in leaves)
 
 
+def test_the_second_policy_may_begin_as_the_first(agent, demonstration):
+    # An agent that never improves shows what it began as.
+    still = agent._replace(improve=lambda state, rollout, rewards: state)
+    training = SSRRTraining(
+        levels=(0.0, 0.3, 0.6, 0.9),
+        trajectories=1,
+        regression=Regression(hidden=(), members=1, snippets=80, iterations=1, shortest=5, longest=30),
+        rounds=1,
+        start="first",
+    )
+    learner = ssrr(
+        still, airl_discriminator(2, PUSH, state_only=True), NoisyTraining(rounds=1, updates=1), training
+    )
+    before = learner.init(jax.random.key(0))
+    after, _ = learner.update(before, demonstration)
+    weights = [p.generator.policy.mean.weights[0] for p in (before, before.first, after, after.first)]
+    assert (weights[0] != weights[1]).any()
+    np.testing.assert_array_equal(weights[2], weights[3])
+
+
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [
         ({"rounds": 0}, "rounds"),
         ({"trajectories": 0}, "trajectories"),
         ({"levels": (0.0, 0.5)}, "four levels"),
+        ({"start": "last"}, "scratch, first"),
         ({"regression": Regression(members=0)}, "members"),
     ],
 )
