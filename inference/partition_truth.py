@@ -223,7 +223,7 @@ class Partition(NamedTuple):
     ------
     box : Box
     points : float ``[S, m, d]``
-        A grid in each of the ``S = Q ** d`` cells, over which is integrated.
+        A grid in each of the ``S = Q ** d`` cells, over which the policy is averaged.
     mdp : TabularMDP
         The cells' transitions: the share of a cell's points whose successor is in each cell (T1).
     """
@@ -261,11 +261,13 @@ def partition(
     *,
     parts: int = 10,
     points: int = 10_000,
+    policy_points: int = 100,
     slack: float = 1e-6,
 ) -> Partition:
     """Cut a box into ``parts ** d`` cells and integrate the dynamics over each (T1 and T3).
 
-    ``points`` a cell (rounded to a full grid) stand for it. ``slack`` goes to the cells about those that are
+    ``points`` a cell (rounded to a full grid) stand for it, and ``policy_points`` where the policy is
+    averaged, which is smooth and asked for at every call. ``slack`` goes to the cells about those that are
     reached, since a grid misses what is finer than itself.
     """
     box = _box(low, high)
@@ -274,18 +276,21 @@ def partition(
         raise ValueError(
             f"parts, points and n_actions must be at least 1, got {parts}, {points} and {n_actions}"
         )
-    side = max(round(points ** (1 / d)), 1)
     width = (box.high - box.low) / parts
-    inside = _grid((jnp.arange(side) + 0.5) / side, d)
     corners = box.low + width * _grid(jnp.arange(parts), d)
-    grid = corners[:, None] + width * inside
     n_cells = len(corners)
+
+    def within(count: int) -> Float[Array, "S m d"]:
+        side = max(round(count ** (1 / d)), 1)
+        return corners[:, None] + width * _grid((jnp.arange(side) + 0.5) / side, d)
+
+    grid = within(points)
     following = jnp.stack(
         [_cells(box, parts, dynamics(grid, jnp.full(grid.shape[:-1], a))) for a in range(n_actions)], 1
     )
-    pair = np.repeat(np.arange(n_cells * n_actions), len(inside))
+    pair = np.repeat(np.arange(n_cells * n_actions), grid.shape[1])
     shares = sparse.csr_array(
-        (np.full(len(pair), 1 / len(inside)), (pair, np.asarray(following).ravel())),
+        (np.full(len(pair), 1 / grid.shape[1]), (pair, np.asarray(following).ravel())),
         shape=(n_cells * n_actions, n_cells),
     ).toarray()
     about = ndimage.maximum_filter(
@@ -293,7 +298,7 @@ def partition(
     ).reshape(shares.shape)
     shares = (1 - slack) * shares + slack * about / about.sum(1, keepdims=True)
     mdp = TabularMDP.from_sparse(sparse.csr_array(shares), np.ones((n_cells, n_actions, 1)))
-    return Partition(box, grid, mdp)
+    return Partition(box, within(policy_points), mdp)
 
 
 def _grid(marks: Array, d: int) -> Float[Array, "N d"]:
@@ -317,13 +322,7 @@ class PartitionTruth(NamedTuple):
         A report is as likely as the truths behind it that lie in the cell (T4 and T5; the density of a cell's
         states being uniform, its constant is left out).
         """
-        places, log_report = sensor.candidates(chain.observations, chain.actions)
-        log_report = jnp.where(self.partition.box.holds(places), log_report, -jnp.inf)
-        mdp = self.partition.mdp
-        held = jax.nn.one_hot(self.partition.cell(places), mdp.n_states) * jnp.exp(log_report)[..., None]
-        taken = jax.nn.one_hot(chain.actions, mdp.n_actions)
-        evidence = jnp.log(held.sum(2)[..., None] * taken[..., None, :])
-        return evidence + self.partition.log_policy(policy)
+        return _cell_factors(self.partition, policy, sensor, chain)[0]
 
     def cells(self, chain: Recording, policy: Any, sensor: FiniteSensor) -> Float[Array, "n L S"]:
         """Posterior probability of each cell."""
@@ -336,46 +335,57 @@ class PartitionTruth(NamedTuple):
         self, chain: Recording, policy: Any, key: Array, sensor: FiniteSensor
     ) -> tuple[Recording, Truths]:
         """Joint draws of cells, and in each of them a truth of the report."""
-        places, log_report = sensor.candidates(chain.observations, chain.actions)
-        log_report = jnp.where(self.partition.box.holds(places), log_report, -jnp.inf)
-        drawn = _drawn_places(
-            key,
-            self.partition.mdp,
-            self.factors(chain, policy, sensor),
-            chain.live,
-            self.partition.cell(places),
-            log_report,
-            places,
-            self.draws,
-        )
+        drawn = _drawn_places(key, self.partition, policy, sensor, chain, self.draws)
         return chain, truths(chain, drawn, jnp.broadcast_to(chain.actions, drawn.shape[:-1]))
 
 
-@partial(jax.jit, static_argnums=7)
+class _Behind(NamedTuple):
+    """The truths behind each report: where they are, in which cell, and how likely each makes it."""
+
+    places: Float[Array, "n L K d"]
+    cells: Array
+    log_report: Float[Array, "n L K"]
+
+
+@jax.jit
+def _cell_factors(
+    partition: Partition, policy: Any, sensor: FiniteSensor, chain: Recording
+) -> tuple[Float[Array, "n L S A"], _Behind]:
+    places, log_report = sensor.candidates(chain.observations, chain.actions)
+    log_report = jnp.where(partition.box.holds(places), log_report, -jnp.inf)
+    cells = partition.cell(places)
+    held = jax.nn.one_hot(cells, partition.mdp.n_states) * jnp.exp(log_report)[..., None]
+    taken = jax.nn.one_hot(chain.actions, partition.mdp.n_actions)
+    evidence = jnp.log(held.sum(2)[..., None] * taken[..., None, :])
+    return evidence + partition.log_policy(policy), _Behind(places, cells, log_report)
+
+
+@jax.jit
+def _cell_posterior(
+    partition: Partition, policy: Any, sensor: FiniteSensor, chain: Recording
+) -> Float[Array, "n L S"]:
+    factors, _ = _cell_factors(partition, policy, sensor, chain)
+    return jax.vmap(lambda e, live: smooth(partition.mdp, e, live).pairs.sum(-1))(factors, chain.live)
+
+
+@partial(jax.jit, static_argnums=5)
 def _drawn_places(
-    key: Array,
-    mdp: TabularMDP,
-    factors: Float[Array, "n L S A"],
-    live: Array,
-    cells: Array,
-    log_report: Float[Array, "n L K"],
-    places: Float[Array, "n L K d"],
-    draws: int,
+    key: Array, partition: Partition, policy: Any, sensor: FiniteSensor, chain: Recording, draws: int
 ) -> Float[Array, "M n L d"]:
-    def one(key: Array, factor: Array, live: Array, cells: Array, log_report: Array, places: Array) -> Array:
-        filtered = filter_forward(mdp, factor, live)
+    def one(key: Array, factor: Array, live: Array, behind: _Behind) -> Array:
+        filtered = filter_forward(partition.mdp, factor, live)
 
         def draw(key: Array) -> Array:
             key_cell, key_place = jax.random.split(key)
-            drawn, _ = sample_backward(key_cell, mdp, factor, filtered, live)
-            within = jnp.where(cells == drawn[:, None], log_report, -jnp.inf)
+            drawn, _ = sample_backward(key_cell, partition.mdp, factor, filtered, live)
+            within = jnp.where(behind.cells == drawn[:, None], behind.log_report, -jnp.inf)
             which = jnp.where(live, jax.random.categorical(key_place, within), 0)
-            return jnp.take_along_axis(places, which[:, None, None], 1)[:, 0]
+            return jnp.take_along_axis(behind.places, which[:, None, None], 1)[:, 0]
 
         return jax.vmap(draw)(jax.random.split(key, draws))
 
-    keys = jax.random.split(key, len(places))
-    return jax.vmap(one, out_axes=1)(keys, factors, live, cells, log_report, places)
+    factors, behind = _cell_factors(partition, policy, sensor, chain)
+    return jax.vmap(one, out_axes=1)(jax.random.split(key, len(factors)), factors, chain.live, behind)
 
 
 def partition_truth(

@@ -38,6 +38,12 @@ class Pumping(NamedTuple):
 POLICY = Pumping(jnp.array(100.0))
 
 
+@pytest.fixture(scope="module")
+def coarse():
+    """Nine cells."""
+    return partition_truth(mountain_car_dynamics, LOW, HIGH, 3, parts=3, points=900)
+
+
 def driven(lengths, seed=0):
     rng = np.random.default_rng(seed)
     n = len(lengths)
@@ -153,18 +159,18 @@ def test_transitions_of_cells_are_shares_of_their_area():
     np.testing.assert_allclose(found, dense, atol=1e-12)
 
 
-def test_the_policy_of_a_cell_is_its_mean_over_the_cell():
-    cut = partition(mountain_car_dynamics, LOW, HIGH, 3, parts=4, points=40**2)
+def test_the_policy_of_a_cell_is_its_mean_over_the_cell(coarse):
+    cut = coarse.partition
     points = np.random.default_rng(0).uniform(LOW, HIGH, (200_000, 2))
     cells, p = np.asarray(cut.cell(points)), np.exp(POLICY.log_probs(jnp.asarray(points)))
     found = np.exp(cut.log_policy(POLICY))
-    for s in range(16):
+    for s in range(9):
         here = p[cells == s]
         np.testing.assert_allclose(found[s], here.mean(0), atol=5 * 0.5 / np.sqrt(len(here)))
 
 
-def test_the_posterior_of_cells_is_that_of_enumeration():
-    truth = partition_truth(mountain_car_dynamics, LOW, HIGH, 3, parts=3, points=900)
+def test_the_posterior_of_cells_is_that_of_enumeration(coarse):
+    truth = coarse
     reported = distort(KEY, ShiftSensor(0.3, 0.4), driven((4, 3)))
     sensor = ShiftSensor(0.3, 0.4)
     factors = np.asarray(truth.factors(reported, POLICY, sensor))
@@ -191,8 +197,8 @@ def test_the_posterior_of_cells_is_that_of_enumeration():
         assert np.isneginf(factors[i, 0][:, np.arange(3) != actions[0]]).all()
 
 
-def test_draws_lie_in_the_drawn_cells_and_behind_the_reports():
-    truth = partition_truth(mountain_car_dynamics, LOW, HIGH, 3, points=900, draws=3)
+def test_draws_are_behind_the_reports(coarse):
+    truth = coarse._replace(draws=3)
     reported = distort(KEY, SENSOR, driven((20, 12)))
     chain, drawn = truth.refresh(truth.init(reported, SENSOR), POLICY, KEY, SENSOR)
     log_p = SENSOR.log_prob(chain.observations, chain.actions, drawn.observations, drawn.actions)
@@ -200,13 +206,10 @@ def test_draws_lie_in_the_drawn_cells_and_behind_the_reports():
     assert np.asarray(drawn.usable).sum() == 3 * (19 + 11)
 
 
-def test_a_report_that_nothing_can_be_behind_is_named():
+def test_a_report_that_nothing_can_be_behind_is_named(coarse):
     reported = driven((5, 4))
     reported = reported._replace(observations=reported.observations.at[1, 2, 0].set(2.0))
-    for truth in (
-        candidate_truth(mountain_car_dynamics, LOW, HIGH),
-        partition_truth(mountain_car_dynamics, LOW, HIGH, 3, parts=2, points=4),
-    ):
+    for truth in (candidate_truth(mountain_car_dynamics, LOW, HIGH), coarse):
         with pytest.raises(ValueError, match="trajectory 1, step 2"):
             truth.init(reported, SENSOR)
 
