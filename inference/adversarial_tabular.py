@@ -66,11 +66,15 @@ if TYPE_CHECKING:
 else:
     optax = required("optax")
 
+
 # -- learners -----------------------------------------------------------------------------------------
 
 
 def airl_tabular(mdp: TabularMDP, **options: Any) -> Learner:
-    """Online AIRL that takes reports for the truth; what was not seen is left out. Options as below."""
+    """Online AIRL that takes reports for the truth; what was not seen is left out.
+
+    A session in which nothing was seen changes nothing. Options as for :func:`robust_airl_tabular`.
+    """
     return _at_face_value("AIRL", mdp, tabular_airl, _AIRL, options)
 
 
@@ -306,6 +310,9 @@ def _learner(
         # A report that cannot be must not spoil what was learned (a fleet raises nothing).
         possible = jnp.isfinite(own)
         new = jax.tree.map(partial(_chosen, possible), TabularAdversarialState(*parts), state)
+        # Where nothing of the expert is known there is nothing to tell the generator from.
+        unseen = state._replace(session=state.session + possible, key=keys[0])
+        new = jax.tree.map(partial(_chosen, jnp.any(kept.weights > 0)), new, unseen)
         return new, _report(new, own, demonstration, met)
 
     def _report(new: Any, own: Array, demonstration: Demonstration, met: Losses) -> Any:

@@ -38,6 +38,7 @@ from i2rl.inference.transitions import (
 )
 from i2rl.models import Demonstration, DemonstrationError, Sensor, TabularMDP, Visibility, simulate, soft_plan
 from i2rl.models.confusions import Confusions
+from i2rl.models.demonstration import HIDDEN
 from i2rl.models.evidence import observe
 
 LENGTH = 5
@@ -207,17 +208,26 @@ def sensor_learned(learned: Learner, sessions_of) -> TabularAdversarialState:
 
 
 def test_hidden_and_wrong_reports_cost_little_where_they_are_understood(
-    mdp, expert, sensor, sessions_of, sensor_learned
+    mdp, expert, sensor, watched, sessions_of, sensor_learned
 ):
     options = {"rounds": 40, "learning_rate": 1e-2, "horizon": LENGTH}
     known = sessions_of(robust_airl_tabular(mdp, sensor, **options))
-    taken = sessions_of(airl_tabular(mdp, **options))
+    at_face_value = airl_tabular(mdp, **options)
+    taken = sessions_of(at_face_value)
 
     def mean_distance(state):
         return float(0.5 * np.abs(np.exp(state.log_policy) - np.exp(expert)).sum(1).mean())
 
     assert mean_distance(known) < 0.6 * mean_distance(taken)
     assert mean_distance(sensor_learned) < 0.6 * mean_distance(taken)
+    # A session in which nothing was seen says nothing to those who believe their eyes.
+    blank = watched[1].select(slice(0, 64))
+    blank = blank._replace(kind=np.where(blank.kind > 0, HIDDEN, blank.kind), state=0 * blank.state - 1)
+    fresh = at_face_value.init(jax.random.key(0))
+    after, _ = at_face_value.update(fresh, blank)
+    np.testing.assert_array_equal(after.weights, fresh.weights)
+    np.testing.assert_array_equal(after.log_policy, fresh.log_policy)
+    assert int(after.session) == 1
 
 
 def test_how_often_reports_err_is_learned(noise, watched, sensor_learned):
