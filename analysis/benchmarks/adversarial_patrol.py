@@ -19,7 +19,7 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -236,41 +236,6 @@ def noise_study(
     AIRL learners with and without memory of earlier sessions.
     """
     patrol = instance(2)
-    variants = [
-        (CLEAN, 0.0), (NOISY, 0.0), (ROBUST, 0.0), (CLEAN, 1.0), (NOISY, 1.0), (ROBUST, 1.0), (LME, 1.0),
-        (LEARNED, 1.0), (LEARNED, 0.0), (LOGITS, 0.0), (GIBBS, 0.0),
-    ]  # fmt: skip
-    for level in levels:
-        first = level == levels[0]
-        streams = noisy_streams(patrol, level, runs, sessions)
-        methods = noise_methods(streams, patrol)
-        for name, memory in variants if first else [v for v in variants if v[0] in (NOISY, ROBUST)]:
-            count = runs if first and name not in (GIBBS, LOGITS) else min(few, runs)
-            tried = trials if count == runs and first else 0
-            make, seen = methods[name]
-            own = Demonstration(*(x[:count] for x in seen))
-            learner = make(memory=memory, rounds=rounds)
-
-            def action(
-                name: str = name,
-                memory: float = memory,
-                level: float = level,
-                learner: Learner = learner,
-                own: Demonstration = own,
-                tried: int = tried,
-                pairs: np.ndarray = streams.pairs,
-            ) -> dict[str, Any]:
-                found = outcome_of(patrol, learner, own)
-                success = success_rates(patrol, found.policies, tried) if tried else np.zeros(0)
-                return {
-                    "name": name, "level": level, "memory": memory, "seconds": found.seconds,
-                    "final": float(found.accuracy[:, -LAST:].mean()), "trials": tried,
-                    "success mean": float(success.mean()) if tried else None,
-                    "pairs": pairs.tolist(), "accuracy": found.accuracy.round(5).tolist(),
-                    "success": success.tolist(), "noise": found.noise.round(5).tolist(),
-                }  # fmt: skip
-
-            file.measure("noise", f"{name}, {level:g}, memory {memory:g}", action)
     true = np.broadcast_to(patrol.expert_policy(), (runs, *patrol.expert_policy().shape))
 
     def with_the_true_policy() -> dict[str, Any]:
@@ -278,6 +243,42 @@ def noise_study(
         return {"success": success.tolist(), "success mean": float(success.mean()), "trials": trials}
 
     file.measure("noise", "true policy", with_the_true_policy)
+    first, *others = levels
+    jobs = [
+        *((first, name, 0.0) for name in (CLEAN, NOISY, ROBUST)),
+        *((first, name, 1.0) for name in (CLEAN, NOISY, ROBUST, LME, LEARNED)),
+        *((level, name, memory) for level in others for memory in (0.0, 1.0) for name in (NOISY, ROBUST)),
+        *((first, name, 0.0) for name in (LEARNED, LOGITS, GIBBS)),
+    ]  # fmt: skip
+    streams_of = cache(partial(noisy_streams, patrol, runs=runs, sessions=sessions))
+    for level, name, memory in jobs:
+        everything = level == first and name not in (GIBBS, LOGITS)
+        count, tried = (runs, trials) if everything else (min(few, runs), 0)
+        streams = streams_of(level)
+        make, seen = noise_methods(streams, patrol)[name]
+        learner = make(memory=memory, rounds=rounds)
+        own = Demonstration(*(x[:count] for x in seen))
+
+        def action(
+            name: str = name,
+            memory: float = memory,
+            level: float = level,
+            learner: Learner = learner,
+            own: Demonstration = own,
+            tried: int = tried,
+            pairs: np.ndarray = streams.pairs,
+        ) -> dict[str, Any]:
+            found = outcome_of(patrol, learner, own)
+            success = success_rates(patrol, found.policies, tried) if tried else np.zeros(0)
+            return {
+                "name": name, "level": level, "memory": memory, "seconds": found.seconds,
+                "final": float(found.accuracy[:, -LAST:].mean()), "trials": tried,
+                "success mean": float(success.mean()) if tried else None,
+                "pairs": pairs.tolist(), "accuracy": found.accuracy.round(5).tolist(),
+                "success": success.tolist(), "noise": found.noise.round(5).tolist(),
+            }  # fmt: skip
+
+        file.measure("noise", f"{name}, {level:g}, memory {memory:g}", action)
 
 
 def view_study(file: _File, *, runs: int, sessions: int, rounds: int) -> None:
