@@ -39,23 +39,22 @@ def noise_curves(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     figure = new_figure(theme, 9.6, 4.8)
     figure.get_layout_engine().set(wspace=0.05)  # type: ignore[union-attr, call-arg]
     panels = figure.subplots(1, 2, sharey=True)
-    least = 1.0
+    least = 0.9
     for panel, (memory, title) in zip(panels, _MEMORY.items(), strict=True):
         for i, name in enumerate((CLEAN, NOISY, ROBUST, LEARNED, LME)):
             one = _noise(results, name, 0.05 if name == CLEAN else level, 1.0 if name == LME else memory)
             if one is None:
                 continue
             _draw_mean(panel, theme, i, name, np.array(one["pairs"]), np.array(one["accuracy"]))
-            least = min(least, float(np.mean(one["accuracy"], axis=0)[2:].min()))
+            least = min(least, float(np.mean(one["accuracy"], axis=0)[1:].min()))
         dress(panel, theme, title=title, x="state-action pairs seen")
         panel.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     panels[0].set_ylim(np.floor(least * 20) / 20, 1.005)
     panels[0].set_ylabel("learned behaviour accuracy\n(share of states)", color=theme.ink, fontsize=TEXT)
-    head(
-        figure, theme, panels[0].get_legend_handles_labels()[0],
-        title=f"Patrol, {level:.0%} of forward moves and right turns misreported",
-    )  # fmt: skip
-    runs = len(next(iter(results["noise"].values()))["accuracy"])
+    shown = {label: h for p in panels for h, label in zip(*p.get_legend_handles_labels(), strict=True)}
+    title = f"Patrol, {level:.0%} of forward moves and right turns misreported"
+    head(figure, theme, list(shown.values()), title=title)
+    runs = max(len(r["accuracy"]) for r in results["noise"].values() if "accuracy" in r)
     foot(figure, theme, f"line: mean of {runs} runs; band: its 95% interval; the axis does not begin at zero")
     return figure
 
@@ -103,10 +102,10 @@ def _breaches(axes: Axes, results: Results, theme: Theme, level: float) -> None:
     rows = [(name, memory) for memory in (0.0, 1.0) for name in (CLEAN, NOISY, ROBUST, LEARNED)]
     rows.append((LME, 1.0))
     there = [(n, m, one) for n, m in rows if (one := _noise(results, n, level, m)) and one["success"]]
-    named = [(n if n == LME else _with_memory(n, m), n, np.array(one["success"])) for n, m, one in there]
+    named = [(n if n == LME else _with_memory(n, m), np.array(one["success"])) for n, m, one in there]
     if "true policy" in results["noise"]:
-        named.append(("true policy", "", np.array(results["noise"]["true policy"]["success"])))
-    for y, (_, name, success) in enumerate(named):
+        named.append(("true policy", np.array(results["noise"]["true policy"]["success"])))
+    for y, (name, success) in enumerate(named):
         if name in PUBLISHED:
             low, high = PUBLISHED[name]
             axes.barh(y, high - low, left=low, height=0.55, color=theme.muted, alpha=0.45, linewidth=0)
@@ -116,7 +115,7 @@ def _breaches(axes: Axes, results: Results, theme: Theme, level: float) -> None:
     dress(
         axes, theme, title=f"Breaches that succeed, {level:.0%} misreports", x="share of breaches", grid="x"
     )
-    axes.set_yticks(range(len(named)), [label for label, _, _ in named], fontsize=SMALL)
+    axes.set_yticks(range(len(named)), [label for label, _ in named], fontsize=SMALL)
     axes.set_ylim(len(named) - 0.4, -0.6)
     axes.set_xlim(0, 1.02)
 
