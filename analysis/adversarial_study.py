@@ -9,9 +9,8 @@ Runs are independent, so they may be shared out over processes and kept on disk 
 
 from __future__ import annotations
 
-import hashlib
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import lru_cache
 from multiprocessing import get_context
@@ -21,21 +20,22 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, ArrayLike, Float, Int
 
-from ..domains.experts import load_demonstrations, load_expert
+from ..domains.experts import load_demonstrations
 from ..domains.locomotion import ROBOTS, locomotion
 from ..domains.simulation import LEVELS, Perturbed, Trajectories, graded_mix, simulate
 from ..inference.airl import Training, adversarial
 from ..inference.discriminator import airl_discriminator
-from ..inference.gaussian_truth import gaussian_truth
 from ..inference.noisy_airl import NoisyTraining
 from ..inference.ppo import ppo
-from ..inference.robust_airl import robust_airl, robust_airl_with_sensor
+from ..inference.robust_airl import Smoothed, robust_airl, robust_airl_with_sensor
 from ..inference.session import Learner
-from ..inference.ssrr import Regression, SSRRTraining, ssrr
-from ..models.sensing import GaussianSensor, Recording, distort
-from .adversarial_metrics import behaviour_accuracies, returns_at_fixed_length
+from ..inference.snippet_regression import Regression
+from ..inference.ssrr import SSRRTraining, ssrr
+from ..models.sensing import Recording, distort
+from .adversarial_cases import PLANS, Case, Plan, case
+from .adversarial_metrics import EmpiricalILE, bounded_ile, returns_at_fixed_length
 from .adversarial_results import (
     CLEAN,
     LEARNED,
@@ -57,56 +57,6 @@ from .adversarial_results import (
 STUDIED = (CLEAN, NOISY, ROBUST, LEARNED, SSRR)
 
 
-class Plan(NamedTuple):
-    """How a robot is learned from.
-
-    Fields
-    ------
-    sessions : int
-    rounds : int, of discriminator and generator in a session; SSRR shares them out over its two policies
-    covariance : float, of the sensor, for states and actions
-    assumed : float, what is believed of it where it is learned
-    trajectories : int, demonstrated in a session
-    length : int, steps of each
-    updates, batch : int, of the discriminator in a round
-    penalty : float, of its gradient
-    process : float, ``Q``
-    episodes : int, judged in every session
-    settings : of PPO, as pairs
-    """
-
-    sessions: int = 10
-    rounds: int = 25
-    covariance: float = 0.05
-    assumed: float = 0.02
-    trajectories: int = 1
-    length: int = 1000
-    updates: int = 16
-    batch: int = 256
-    penalty: float = 1.0
-    process: float = 1e-4
-    episodes: int = 8
-    settings: tuple[tuple[str, Any], ...] = (
-        ("n_envs", 20),
-        ("n_steps", 128),
-        ("hidden", (64, 64)),
-        ("log_deviation", -0.5),
-        ("scale_rewards", True),
-    )
-
-    @property
-    def digest(self) -> str:
-        """Short name of all settings."""
-        return hashlib.sha256(json.dumps(self).encode()).hexdigest()[:12]
-
-
-PLANS = {
-    "hopper": Plan(),
-    "walker2d": Plan(),
-    "half-cheetah": Plan(),
-}
-
-
 class Outcome(NamedTuple):
     """One run.
 
@@ -116,9 +66,11 @@ class Outcome(NamedTuple):
     returns, accuracy : float ``[T]``
     seconds : float ``[T]``
     scatter : RewardScatter
-    sensor : float ``[T, d + k]``, the diagonal of the learned covariance; else empty
+    error : EmpiricalILE
+    sensor : float ``[T, p]``, the learned sensor (a covariance's diagonal); else empty
     episode : float ``[t, d]``, the beginning of an episode of what was learned
     belief : Belief or None
+    cells : float ``[Q, Q]``, LBA of each cell; empty where there are none
     """
 
     pairs: Int[np.ndarray, " T"]
@@ -127,150 +79,166 @@ class Outcome(NamedTuple):
     accuracy: Float[np.ndarray, " T"]
     seconds: Float[np.ndarray, " T"]
     scatter: RewardScatter
-    sensor: Float[np.ndarray, "T D"]
+    error: EmpiricalILE
+    sensor: Float[np.ndarray, "T p"]
     episode: Float[np.ndarray, "t d"]
     belief: Belief | None
+    cells: Float[np.ndarray, "Q Q"]
 
 
 @lru_cache(maxsize=8)
 def learner(name: str, method: str, plan: Plan) -> Learner:
-    """The learner of a robot by a method; compiled once a process."""
-    robot = locomotion(name)
-    size, k = robot.observation_size, robot.actions.size
-    agent = ppo(robot, **dict(plan.settings))
-    discriminator = airl_discriminator(size, robot.actions, agent.settings.gamma)
-    training = Training(plan.rounds, plan.updates, plan.batch, penalty=plan.penalty, refresh=plan.rounds)
-    common = {"discriminator": discriminator, "training": training, **_truth(name, plan)}
+    """The learner of a task by a method; compiled once a process."""
+    of = case(name, plan)
+    task = of.environment
+    agent = ppo(task, **dict(plan.settings))
+    discriminator = airl_discriminator(task.observation_size, task.actions, agent.settings.gamma)
+    training = Training(
+        plan.rounds,
+        plan.updates,
+        plan.batch,
+        plan.learning_rate,
+        penalty=plan.penalty,
+        refresh=plan.rounds,
+    )
     if method in (CLEAN, NOISY):
         return adversarial("AIRL", agent, discriminator, training=training)
     if method == ROBUST:
-        sensor = GaussianSensor(plan.covariance, plan.covariance).sized(size, k)
-        return robust_airl(agent, sensor, robot, **common)
+        return robust_airl(agent, of.truth(_DRAWS), of.sensor, discriminator=discriminator, training=training)
     if method == LEARNED:
-        assumed = GaussianSensor(plan.assumed, plan.assumed).sized(size, k)
-        return robust_airl_with_sensor(agent, assumed, robot, **common)
-    # The same steps in all: ranking costs some, and the rest is halved between imitation and the end.
-    levels = tuple(0.1 * i for i in range(10))
-    ranking = len(levels) * robot.horizon / agent.settings.steps
+        return robust_airl_with_sensor(
+            agent, of.truth(_DRAWS), of.assumed, of.fit, discriminator=discriminator, training=training
+        )
+    # The same steps in all: ranking takes some, and the rest is halved between imitation and the end.
+    ranking = len(_SSRR_LEVELS) * task.horizon / agent.settings.steps
     half = max(int((plan.rounds - ranking) // 2), 1)
     return ssrr(
         agent,
-        airl_discriminator(size, robot.actions, agent.settings.gamma, state_only=True),
+        airl_discriminator(task.observation_size, task.actions, agent.settings.gamma, state_only=True),
         NoisyTraining(rounds=half, updates=plan.updates, batch=plan.batch),
-        SSRRTraining(levels, 1, Regression(hidden=(64, 64), iterations=300), rounds=half),
+        SSRRTraining(_SSRR_LEVELS, 1, _REGRESSION, rounds=half),
     )
 
 
-def _truth(name: str, plan: Plan) -> dict[str, Any]:
-    """What smoothing is told of a robot: how exact its dynamics are, and what is cut off."""
-    robot = locomotion(name)
-    limit = np.full(robot.observation_size, np.inf)
-    if name != "half-cheetah":  # Gymnasium shows velocities of these up to 10 only
-        limit[(robot.observation_size + 1) // 2 - 1 :] = 10.0
-    bounds = {"observation_bounds": (-limit, limit), "action_bounds": (robot.actions.low, robot.actions.high)}
-    return {"process_covariance": plan.process, **bounds}
+_DRAWS = 4
+_SSRR_LEVELS = tuple(0.1 * i for i in range(10))
+_REGRESSION = Regression(
+    hidden=(64, 64), points=32, iterations=500, learning_rate=1e-3, deviation=0.1
+)  # of a session, the networks being carried on
 
 
 def run(name: str, method: str, seed: int, plan: Plan) -> Outcome:
     """One seed of one method."""
-    robot = locomotion(name)
-    level = locomotion(name, terminate_when_unhealthy=False)
-    expert = load_expert(name)
-    whole = load_demonstrations(name).recording
+    of = case(name, plan)
     k_learner, k_noise, k_judge = jax.random.split(jax.random.key(seed), 3)
-    sensor = GaussianSensor(plan.covariance, plan.covariance).sized(
-        robot.observation_size, robot.actions.size
-    )
     online = learner(name, method, plan)
     state = online.init(k_learner)
     rows: list[tuple] = []
-    learned_sensor = []
-    reported = truth = _session(whole, 0, seed, plan)
+    sensors = []
     for session in range(plan.sessions):
-        truth = _session(whole, session, seed, plan)
-        reported = distort(jax.random.fold_in(k_noise, session), sensor, truth)
-        state, report = online.update(state, truth if method == CLEAN else reported)  # type: ignore[arg-type]
+        truth = _session(of.demonstrations, session, seed, plan)
+        reported = distort(jax.random.fold_in(k_noise, session), of.sensor, truth)
+        given: Any = truth if method == CLEAN else reported
+        report: Any
+        state, report = online.update(state, given)
         policy = state.generator.policy
         returns = returns_at_fixed_length(
-            level, policy, jax.random.fold_in(k_judge, session), plan.episodes, deterministic=True
+            of.level, policy, jax.random.fold_in(k_judge, session), plan.episodes, None, deterministic=True
         )
-        agreement = behaviour_accuracies(level, expert, policy, k_judge, 2, 500)
-        rows.append(
-            (report.pairs, report.environment_steps, returns.mean(), agreement.expert, report.seconds)
-        )
+        accuracy = of.accuracy(policy, k_judge)
+        rows.append((report.pairs, report.environment_steps, returns.mean(), accuracy, report.seconds))
         if method == LEARNED:
-            learned_sensor.append(np.concatenate([np.diag(np.asarray(c)) for c in state.sensor]))
-    pairs, steps, returns, accuracy, seconds = map(np.array, zip(*rows, strict=True))
-    belief = _belief(name, policy, truth, reported, sensor, plan) if method == ROBUST else None
-    episode = simulate(level, policy, k_judge, 1, 200, deterministic=True).observations[0]
-    scatter = _scatter(name, state.network, seed)
-    found = np.array(learned_sensor) if learned_sensor else np.zeros((0, 0))
-    return Outcome(pairs, steps, returns, accuracy, seconds, scatter, found, episode, belief)
+            sensors.append(_sensor_numbers(state.sensor))
+    pairs, steps, seen_returns, accuracies, seconds = map(np.array, zip(*rows, strict=True))
+    return Outcome(
+        pairs,
+        steps,
+        seen_returns,
+        accuracies,
+        seconds,
+        _scatter(name, plan, state.network, seed),
+        _error(of, state.network, policy, k_judge),
+        np.array(sensors) if sensors else np.zeros((0, 0)),
+        simulate(of.level, policy, k_judge, 1, 200, deterministic=True).observations[0],
+        _belief(of, policy, truth, reported) if method == ROBUST else None,
+        of.cells(policy) if of.cells else np.zeros((0, 0)),
+    )
+
+
+def _sensor_numbers(sensor: Any) -> Float[np.ndarray, " p"]:
+    parts = [np.asarray(x, float) for x in jax.tree.leaves(sensor)]
+    return np.concatenate([np.diag(x) if x.ndim == 2 else np.ravel(x) for x in parts])
 
 
 def _session(whole: Recording, session: int, seed: int, plan: Plan) -> Recording:
-    """A session's demonstrations: the next of the recorded ones, from a step that the seed says."""
+    """A session's demonstrations: the next of those there are, other ones first for another seed."""
     total = whole.live.shape[0]
-    chosen = [(seed + session * plan.trajectories + i) % total for i in range(plan.trajectories)]
-    spare = whole.live.shape[1] - plan.length
-    first = int(np.random.default_rng([seed, session]).integers(spare + 1))
-    steps = slice(first, first + plan.length)
-    rows = np.array(chosen)
-    return Recording(
-        whole.observations[rows, steps],
-        whole.actions[rows, steps],
-        whole.live[rows, steps],
-        whole.terminated[rows] & (spare == 0),
-    )
+    order = np.random.default_rng(seed).permutation(total)
+    places = (session * plan.trajectories + np.arange(plan.trajectories)) % total
+    return Recording(*(jnp.asarray(x)[order[places]] for x in whole))
 
 
 @lru_cache(maxsize=4)
-def _held_out(name: str) -> tuple[Trajectories, np.ndarray]:
-    """A hundred episodes of the expert, disturbed to five degrees; the same for all methods and seeds."""
-    level = locomotion(name, terminate_when_unhealthy=False)
-    policies = [Perturbed(load_expert(name), share) for share in LEVELS]
-    return graded_mix(level, policies, jax.random.key(20), 20, 200)
+def _held_out(name: str, plan: Plan) -> tuple[Trajectories, np.ndarray]:
+    """Episodes of the expert, disturbed to several degrees; the same for all methods and seeds."""
+    of = case(name, plan)
+    policies = [Perturbed(of.expert, share) for share in LEVELS]
+    return graded_mix(of.level, policies, jax.random.key(20), 20, of.held_out)
 
 
-def _scatter(name: str, network: Any, seed: int) -> RewardScatter:
-    """Any learned reward of state and action, or of the state alone, on the held-out episodes."""
-    episodes, whose = _held_out(name)
-    seen, done = jnp.asarray(episodes.observations), jnp.asarray(episodes.actions)
-    learned = network(seen) if network.__class__.__name__ == "SSRRReward" else network(seen, done)
-    return reward_scatter(np.asarray(learned), episodes.rewards, episodes.live, whose, jax.random.key(seed))
+def _learned_reward(network: Any, observations: ArrayLike, actions: ArrayLike) -> np.ndarray:
+    """Of state and action, or, as SSRR's, of the state alone."""
+    seen = jnp.asarray(observations)
+    found = network(seen) if type(network).__name__ == "SSRRReward" else network(seen, jnp.asarray(actions))
+    return np.asarray(found, float)
 
 
-def _belief(
-    name: str, policy: Any, truth: Recording, reported: Recording, sensor: GaussianSensor, plan: Plan
-) -> Belief:
-    """What the last policy makes of the beginning of the last demonstration."""
-    robot, shown = locomotion(name), slice(0, 100)
-    cut = Recording(
-        *(x[:1, shown] if x.ndim > 1 else x[:1] & False for x in (reported.observations, reported.actions,
-          reported.live, reported.terminated))
-    )  # fmt: skip
-    smoother = gaussian_truth(robot, robot.observation_size, draws=64, **_truth(name, plan))
-    chain = smoother.init(cut, sensor)
-    _, drawn = smoother.refresh(chain, policy, jax.random.key(0), sensor, passes=6)
-    names, columns = _COMPONENTS[name]
-    k = robot.observation_size
+def _scatter(name: str, plan: Plan, network: Any, seed: int) -> RewardScatter:
+    episodes, whose = _held_out(name, plan)
+    learned = _learned_reward(network, episodes.observations, episodes.actions)
+    return reward_scatter(learned, episodes.rewards, episodes.live, whose, jax.random.key(seed))
 
-    def picked(observations: Array, actions: Array) -> np.ndarray:
-        return np.concatenate([np.asarray(observations), np.asarray(actions)], -1)[..., [*columns, k]]
 
-    return belief_from_draws(
-        (*names, "first joint's torque (share)"),
-        picked(cut.observations[0], cut.actions[0]),
-        picked(truth.observations[0, shown], truth.actions[0, shown]),
-        picked(drawn.observations[:, 0], drawn.actions[:, 0]),
+def _error(of: Case, network: Any, policy: Any, key: Array) -> EmpiricalILE:
+    """By the learned reward: what was demonstrated, before noise, and what the learner does."""
+    shown = of.demonstrations
+    own = simulate(of.level, policy, key, 10, shown.live.shape[1], deterministic=True)
+    return bounded_ile(
+        _learned_reward(network, shown.observations, shown.actions),
+        np.asarray(shown.live),
+        _learned_reward(network, own.observations, own.actions),
+        own.live,
     )
 
 
-_COMPONENTS = {
-    "hopper": (("height (m)", "forward speed (m/s)"), (0, 5)),
-    "walker2d": (("height (m)", "forward speed (m/s)"), (0, 8)),
-    "half-cheetah": (("pitch (rad)", "forward speed (m/s)"), (1, 8)),
-}
+def _belief(of: Case, policy: Any, truth: Recording, reported: Recording) -> Belief:
+    """What the last policy makes of the beginning of the last demonstration."""
+    names, columns = of.components
+    steps = min(_SHOWN_STEPS, int(reported.lengths[0]))
+
+    def first(recording: Recording) -> Recording:
+        observations, actions, live = (x[:1, :steps] for x in recording[:3])
+        return Recording(observations, actions, live, jnp.zeros(1, bool))
+
+    begun = Smoothed(of.truth(64), of.sensor).begin(first(reported), of.sensor, jax.random.key(0))
+    _, drawn = Smoothed(of.truth(64), of.sensor).refresh(begun, of.sensor, policy, jax.random.key(0))
+    d = truth.observations.shape[-1]
+
+    def picked(observations: Any, actions: Any) -> np.ndarray:
+        parts = [np.asarray(observations)]
+        if max(columns) >= d:
+            parts.append(np.asarray(actions))
+        return np.concatenate(parts, -1)[..., list(columns)]
+
+    return belief_from_draws(
+        names,
+        picked(first(reported).observations[0], first(reported).actions[0]),
+        picked(first(truth).observations[0], first(truth).actions[0]),
+        np.moveaxis(picked(drawn.steps.observations, drawn.steps.actions), 1, 0),
+    )
+
+
+_SHOWN_STEPS = 100
 
 
 # -- all seeds and methods ----------------------------------------------------------------------------
@@ -287,48 +255,53 @@ def study(
     machine: str = "",
     advance: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> AdversarialResults:
-    """All seeds of all methods of one robot.
+    """All seeds of all methods on one task.
 
-    Runs found in ``folder`` are not run again, and new ones are kept there. Raises ``ValueError`` for a name
-    that is no robot's and for fewer than one seed.
+    Runs found in ``folder`` are not run again, and new ones are kept there. Raises ``ValueError`` for another
+    name than :data:`.adversarial_cases.PLANS` has, and for fewer than one seed.
     """
-    if name not in ROBOTS:
-        raise ValueError(f"the robot is one of {', '.join(ROBOTS)}; got {name!r}")
     if seeds < 1:
         raise ValueError(f"there must be at least one seed, got {seeds}")
-    plan = PLANS[name] if plan is None else plan
+    of = case(name, plan)
     wanted = [(method, seed) for seed in range(seeds) for method in methods]
     outcomes = {}
-    for done, (which, outcome) in enumerate(_all_runs(name, wanted, plan, workers, folder)):
+    for done, (which, outcome) in enumerate(_all_runs(name, wanted, of.plan, workers, folder)):
         outcomes[which] = outcome
         method, seed = which
         advance(f"{method}, seed {seed}: return {outcome.returns[-1]:.0f}", (done + 1) / len(wanted))
     by_method = {m: [outcomes[m, seed] for seed in range(seeds)] for m in methods}
     shown = {m: runs[0] for m, runs in by_method.items()}
-    robot = locomotion(name)
-    frames: list[FrameStrip] = [frame_strip("expert", robot, load_demonstrations(name).observations[0])]
-    frames += [frame_strip(m, robot, outcome.episode) for m, outcome in shown.items()]
-    settings = {
-        **{k: v for k, v in plan._asdict().items() if k != "settings"},
-        **dict(plan.settings),
-        "environment steps": int(shown[methods[0]].steps[-1]),
-    }
-    if LEARNED in by_method:
-        last = [outcome.sensor[-1].tolist() for outcome in by_method[LEARNED]]
-        settings["learned covariance, a row a seed"] = last
     return AdversarialResults(
         name,
-        f"normal, covariance {plan.covariance:g} of every state and action",
+        of.noise,
         seeds,
         machine,
         {m: _result(runs) for m, runs in by_method.items()},
-        accuracy_over="the expert's own states",
-        expert_return=float(load_demonstrations(name).returns.mean()),
+        accuracy_over=of.accuracy_over,
+        expert_return=of.expert_return,
         scatters={m: outcome.scatter for m, outcome in shown.items()},
         belief=shown[ROBUST].belief if ROBUST in shown else None,
-        frames=tuple(frames),
-        settings=settings,
+        frames=_frames(name, shown),
+        cells={m: np.mean([r.cells for r in runs], 0) for m, runs in by_method.items()} if of.cells else {},
+        settings=_settings(of.plan, by_method),
     )
+
+
+def _frames(name: str, shown: Mapping[str, Outcome]) -> tuple[FrameStrip, ...]:
+    if name not in ROBOTS:
+        return ()
+    robot = locomotion(name)
+    expert = frame_strip("expert", robot, load_demonstrations(name).observations[0])
+    return (expert, *(frame_strip(m, robot, outcome.episode) for m, outcome in shown.items()))
+
+
+def _settings(plan: Plan, runs: Mapping[str, Sequence[Outcome]]) -> dict[str, Any]:
+    """For the file: the plan, the budget of each method, and what was learned of the sensor."""
+    told = {**{k: v for k, v in plan._asdict().items() if k != "settings"}, **dict(plan.settings)}
+    told["environment steps"] = {m: int(outcomes[0].steps[-1]) for m, outcomes in runs.items()}
+    if LEARNED in runs:
+        told["learned sensor, a row a seed"] = [o.sensor[-1].tolist() for o in runs[LEARNED]]
+    return told
 
 
 def _result(runs: Sequence[Outcome]) -> MethodResult:
@@ -337,6 +310,7 @@ def _result(runs: Sequence[Outcome]) -> MethodResult:
         np.array([r.accuracy for r in runs]),
         np.array([r.returns for r in runs]),
         tuple(r.scatter.correlation for r in runs),
+        tuple(r.error for r in runs),
         seconds=float(np.median([r.seconds[1:] for r in runs])) if len(runs[0].seconds) > 1 else None,
     )
 

@@ -250,7 +250,9 @@ def adversarial(
         network, memory, acting = state.network, state.optimiser, state.generator
         replay, sensor, rounds = state.replay, state.sensor, int(state.rounds)
         chain = truth.begin(recording, sensor, k_chain)
-        losses, returns, expert = [], [], None
+        losses: list[Losses] = []
+        returns: list[float] = []
+        expert: ExpertTransitions | None = None
         for r in range(how.rounds):
             key, k_truth, k_updates = jax.random.split(key, 3)
             policy = acting.policy
@@ -280,11 +282,11 @@ def adversarial(
             pairs,
             sensor,
         )
-        met: Losses = jax.tree.map(lambda *x: np.asarray(x, np.float64), *losses)
+        every: Losses = jax.tree.map(lambda *x: np.asarray(x, np.float64), *losses)
         report = AdversarialReport(
             session=int(state.session),
             log_likelihood=float(likelihood(acting.policy, expert)),
-            **met._asdict(),
+            **every._asdict(),
             returns=np.asarray(returns, np.float64),
             pairs=int(pairs),
             environment_steps=rounds * int(np.prod(replay.terminated.shape[1:])),
@@ -403,7 +405,7 @@ def _discriminator_updates(
             return (optax.apply_updates(parameters, change), memory), met
 
         keys = jax.random.split(k_updates, how.updates)
-        (parameters, memory), met = lax.scan(step, (_trainable(network), memory), keys)
-        return _with(network, parameters), memory, Losses(*(x[-1] for x in met))
+        (parameters, memory), every = lax.scan(step, (_trainable(network), memory), keys)
+        return _with(network, parameters), memory, jax.tree.map(lambda x: x[-1], every)
 
     return trained

@@ -5,7 +5,7 @@ What is done about noise is one object, the learner's :class:`~i2rl.inference.ai
 :class:`Smoothed`
     the sensor is known, as the dissertation has it;
 :class:`SmoothedAndFitted`
-    only its form is, and its covariances are fitted to each session by expectation-maximisation.
+    only its form is, and its parameters are fitted to each session by expectation-maximisation.
 
 Either way the truth is found under the generator's current policy, so it sharpens as the policy does, and the
 chain goes on from where the last look left it.
@@ -13,17 +13,20 @@ chain goes on from where the last look left it.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from ..models.networks import Policy
-from ..models.sensing import GaussianSensor, Recording, Truths
+from ..models.sensing import GaussianSensor, Recording, ShiftSensor, Truths
 from .airl import Training, adversarial
 from .discriminator import Discriminator, ExpertTransitions, Transitions, airl_discriminator
-from .gaussian_truth import GaussianTruth, fitted_sensor, gaussian_truth
+from .gaussian_truth import GaussianTruth, fitted_sensor
+from .partition_truth import CandidateTruth, fitted_shift_sensor
 from .session import Learner
 
 
@@ -71,37 +74,50 @@ class Smoothed(NamedTuple):
 
 
 class SmoothedAndFitted(NamedTuple):
-    """The truth by smoothing, the sensor's covariances being fitted in every session.
+    """The truth by smoothing, the sensor being fitted in every session.
 
     Fields
     ------
-    truth : GaussianTruth
-    sensor : GaussianSensor, what is believed before the first session
-    passes : int, as of :class:`Smoothed`
-    steps : int, of expectation-maximisation a session
+    truth, passes : as of :class:`Smoothed`
+    sensor : what is believed before the first session
+    fit : ``(truth, chain, policy, sensor) -> sensor``, one step of expectation-maximisation
+    steps : int, of it a session
     """
 
-    truth: GaussianTruth
-    sensor: GaussianSensor
+    truth: Any
+    sensor: Any
+    fit: Callable[[Any, Any, Policy, Any], Any]
     passes: int = 6
     steps: int = 4
 
-    def prior(self) -> GaussianSensor:
+    def prior(self) -> Any:
         """What is believed of the sensor before the first session."""
         return self.sensor
 
-    begin = Smoothed.begin
-    refresh = Smoothed.refresh
+    def begin(self, recording: Recording, sensor: Any, key: Array) -> Look:
+        """As :meth:`Smoothed.begin`."""
+        return Smoothed(self.truth, sensor, self.passes).begin(recording, sensor, key)
 
-    def learned(self, chain: Look, sensor: GaussianSensor) -> GaussianSensor:
-        """Covariances under which the session's reports are likeliest (diagonal).
+    def refresh(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
+        """As :meth:`Smoothed.refresh`."""
+        return Smoothed(self.truth, sensor, self.passes).refresh(chain, sensor, policy, key)
 
-        Each step is an E-step with the dynamics as last linearised, and the closed-form M-step.
-        """
+    def learned(self, chain: Look, sensor: Any) -> Any:
+        """The sensor under which the session's reports are likeliest."""
+        assert chain.policy is not None
         for _ in range(self.steps):
-            posterior = self.truth.posterior(chain.chain, chain.policy, sensor)
-            sensor = fitted_sensor(chain.chain.reported, posterior)
+            sensor = self.fit(self.truth, chain.chain, chain.policy, sensor)
         return sensor
+
+
+def fit_gaussian(truth: GaussianTruth, chain: Any, policy: Policy, sensor: GaussianSensor) -> GaussianSensor:
+    """Diagonal covariances, with the dynamics as last linearised (closed form)."""
+    return fitted_sensor(chain.reported, truth.posterior(chain, policy, sensor))
+
+
+def fit_shift(truth: CandidateTruth, chain: Any, policy: Policy, sensor: ShiftSensor) -> ShiftSensor:
+    """The probability of a shift (closed form)."""
+    return fitted_shift_sensor(sensor, chain, truth.posterior(chain, policy, sensor))
 
 
 @jax.jit
@@ -120,48 +136,44 @@ def as_expert(drawn: Truths) -> ExpertTransitions:
 
 def robust_airl(
     generator: Any,
-    sensor: GaussianSensor,
-    dynamics: Any,
+    truth: Any,
+    sensor: Any,
     *,
     discriminator: Discriminator | None = None,
     training: Training | None = None,
-    **truth: Any,
 ) -> Learner:
     """robust-AIRL with a known sensor.
 
-    ``dynamics`` has ``next_state`` (:class:`~i2rl.inference.gaussian_truth.Dynamics`), as the robots of
-    :mod:`i2rl.domains.locomotion` do; ``truth`` goes to :func:`gaussian_truth`.
+    Parameters
+    ----------
+    generator : PPO, or as :func:`~i2rl.inference.airl.adversarial` takes it
+    truth : GaussianTruth, CandidateTruth or PartitionTruth
+        With the dynamics: ``gaussian_truth(robot, robot.observation_size)``, say.
+    sensor : the sensor behind the reports, such as :class:`GaussianSensor`
+    discriminator, training : by default AIRL's, and :class:`Training`'s own
     """
-    return _learner("robust-AIRL", Smoothed, generator, sensor, dynamics, discriminator, training, truth)
+    return _learner("robust-AIRL", generator, Smoothed(truth, sensor), discriminator, training)
 
 
 def robust_airl_with_sensor(
     generator: Any,
-    sensor: GaussianSensor,
-    dynamics: Any,
+    truth: Any,
+    sensor: Any,
+    fit: Callable[[Any, Any, Policy, Any], Any] = fit_gaussian,
     *,
     discriminator: Discriminator | None = None,
     training: Training | None = None,
-    **truth: Any,
 ) -> Learner:
-    """robust-AIRL that learns the sensor's covariances too, from ``sensor`` on; else :func:`robust_airl`."""
-    name = "robust-AIRL with sensor"
-    return _learner(name, SmoothedAndFitted, generator, sensor, dynamics, discriminator, training, truth)
+    """robust-AIRL that learns the sensor's parameters too, from ``sensor`` on; else :func:`robust_airl`."""
+    hidden = SmoothedAndFitted(truth, sensor, fit)
+    return _learner("robust-AIRL with sensor", generator, hidden, discriminator, training)
 
 
 def _learner(
-    name: str,
-    kind: Any,
-    generator: Any,
-    sensor: GaussianSensor,
-    dynamics: Any,
-    discriminator: Discriminator | None,
-    training: Training | None,
-    truth: dict[str, Any],
+    name: str, generator: Any, hidden: Any, discriminator: Discriminator | None, training: Training | None
 ) -> Learner:
     environment = generator.environment
-    d, k = environment.observation_size, environment.actions.size
     if discriminator is None:
-        discriminator = airl_discriminator(d, environment.actions)
-    hidden = kind(gaussian_truth(dynamics, d, **truth), sensor.sized(d, k))
-    return adversarial(name, generator, discriminator, hidden, training, {"truth": truth})
+        discriminator = airl_discriminator(environment.observation_size, environment.actions)
+    known = {"truth": type(hidden.truth).__name__, "sensor": jax.tree.map(np.asarray, hidden.sensor)}
+    return adversarial(name, generator, discriminator, hidden, training, known)
