@@ -21,7 +21,7 @@ from ..domains.simulation import simulate
 from ..inference.gaussian_truth import gaussian_truth, jax_dynamics
 from ..inference.partition_truth import candidate_truth
 from ..inference.robust_airl import fit_gaussian, fit_shift
-from ..models.sensing import GaussianSensor, Recording, ShiftSensor
+from ..models.sensing import MOUNTAIN_CAR_SHIFT, GaussianSensor, Recording, ShiftSensor
 from .adversarial_metrics import accuracy_of_cells, behaviour_accuracies
 
 
@@ -34,6 +34,7 @@ class Plan(NamedTuple):
     rounds : int, of discriminator and generator in a session; SSRR shares them out over its two policies
     trajectories : int, demonstrated in a session
     covariance : float, of a Gaussian sensor, for states and actions
+    shift, probability : float, of mountain car's sensor
     process : float, ``Q``: how far the truth is let stray from the dynamics
     updates, batch : int, of the discriminator in a round
     learning_rate, penalty : float, of the discriminator, and of its gradient
@@ -41,16 +42,18 @@ class Plan(NamedTuple):
     settings : of PPO, as pairs
     """
 
-    sessions: int = 10
-    rounds: int = 25
+    sessions: int = 8
+    rounds: int = 20
     trajectories: int = 1
     covariance: float = 0.05
+    shift: float = MOUNTAIN_CAR_SHIFT
+    probability: float = 0.25
     process: float = 1e-4
     updates: int = 16
     batch: int = 256
     learning_rate: float = 1e-3
     penalty: float = 1.0
-    episodes: int = 8
+    episodes: int = 4
     settings: tuple[tuple[str, Any], ...] = (
         ("n_envs", 20),
         ("n_steps", 128),
@@ -197,7 +200,7 @@ def _on_experts_states(environment: Any, expert: Any, length: int, policy: Any, 
 def _mountain_car(plan: Plan) -> Case:
     environment, expert = mountain_car(), load_expert("mountain-car")
     stored = load_demonstrations("mountain-car")
-    sensor = ShiftSensor()
+    sensor = ShiftSensor(jnp.asarray(plan.shift), jnp.asarray(plan.probability))
 
     def cells(policy: Any) -> np.ndarray:
         return accuracy_of_cells(environment, expert, policy)

@@ -25,7 +25,7 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from ..domains.experts import load_demonstrations
 from ..domains.locomotion import ROBOTS, locomotion
 from ..domains.simulation import LEVELS, Perturbed, Trajectories, graded_mix, simulate
-from ..inference.airl import Training, adversarial
+from ..inference.airl import AdversarialTraining, adversarial
 from ..inference.discriminator import airl_discriminator
 from ..inference.noisy_airl import NoisyTraining
 from ..inference.ppo import ppo
@@ -34,7 +34,7 @@ from ..inference.session import Learner
 from ..inference.snippet_regression import Regression
 from ..inference.ssrr import SSRRTraining, ssrr
 from ..models.sensing import Recording, distort
-from .adversarial_cases import PLANS, Case, Plan, case
+from .adversarial_cases import Case, Plan, case
 from .adversarial_metrics import EmpiricalILE, bounded_ile, returns_at_fixed_length
 from .adversarial_results import (
     CLEAN,
@@ -93,7 +93,7 @@ def learner(name: str, method: str, plan: Plan) -> Learner:
     task = of.environment
     agent = ppo(task, **dict(plan.settings))
     discriminator = airl_discriminator(task.observation_size, task.actions, agent.settings.gamma)
-    training = Training(
+    training = AdversarialTraining(
         plan.rounds,
         plan.updates,
         plan.batch,

@@ -66,6 +66,17 @@ class NoisyStarts(StrEnum):
     natural = "natural"
 
 
+class Domain(StrEnum):
+    """Tasks that ``run robust-airl`` knows."""
+
+    patrol = "patrol"
+    mountain_car = "mountain-car"
+    hopper = "hopper"
+    walker2d = "walker2d"
+    half_cheetah = "half-cheetah"
+    onion = "onion"
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of tables.")]
 Instance = Annotated[int, typer.Option(min=1, max=3, help="Patrol instance (1, 2 or 3).")]
 Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same result.")]
@@ -278,6 +289,38 @@ def run_sorting(
         print(json.dumps(sorting_report.summary(study)))
     else:
         sorting_report.print_tables(study, _console())
+        print(f"Report: {report / 'index.html'}")
+
+
+@run.command("robust-airl")
+def run_robust_airl(
+    domain: Annotated[Domain, typer.Option(help="Task, with its expert and its sensor.")] = Domain.hopper,
+    seeds: Annotated[int, typer.Option(min=1, help="Independent repetitions.")] = 1,
+    sessions: Annotated[
+        int | None, typer.Option(min=1, help="Sessions; by default the study's own number.")
+    ] = None,
+    noise: Annotated[
+        float, typer.Option(min=0, help="Times the study's noise (covariance, shift or probability).")
+    ] = 1.0,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that share the runs.")] = 1,
+    kept: Annotated[
+        Path | None, typer.Option(help="Folder where finished runs are kept and found again.")
+    ] = None,
+    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-robust-airl"),
+    as_json: Json = False,
+) -> None:
+    """Learn rewards as networks from noisy reports: AIRL, robust-AIRL and SSRR, judged by the true reward."""
+    from . import adversarial_answer
+
+    with _reported_errors(), _progress(as_json) as advance:
+        results = adversarial_answer.answer(
+            domain.value, seeds, sessions, noise, workers=workers, kept=kept, advance=advance
+        )
+        adversarial_answer.write(results, report)
+    if as_json:
+        print(json.dumps(adversarial_answer.summary(results)))
+    else:
+        adversarial_answer.print_tables(results, _console())
         print(f"Report: {report / 'index.html'}")
 
 

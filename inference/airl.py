@@ -171,7 +171,7 @@ class FaceValue:
         return sensor
 
 
-class Training(NamedTuple):
+class AdversarialTraining(NamedTuple):
     """How a session trains.
 
     Fields
@@ -195,7 +195,7 @@ class Training(NamedTuple):
     replay: int = 1
     refresh: int = 1
 
-    def checked(self) -> Training:
+    def checked(self) -> AdversarialTraining:
         """Itself. Raises ``ValueError`` naming a field that cannot be."""
         for name in ("rounds", "updates", "batch", "replay", "refresh"):
             if getattr(self, name) < 1:
@@ -210,7 +210,7 @@ def adversarial(
     generator: Any,
     discriminator: Discriminator,
     truth: Truth | None = None,
-    training: Training | None = None,
+    training: AdversarialTraining | None = None,
     configuration: Mapping[str, Any] | None = None,
 ) -> Learner:
     """A learner of the session protocol from its parts; its demonstrations are :class:`Recording`.
@@ -222,7 +222,7 @@ def adversarial(
     environment = generator.environment
     task = Task(environment.name, environment.observation_size, environment.actions)
     truth = FaceValue() if truth is None else truth
-    how = (training or Training()).checked()
+    how = (training or AdversarialTraining()).checked()
     optimiser = optax.adam(how.learning_rate)
     trained = _discriminator_updates(discriminator, optimiser, how)
 
@@ -356,7 +356,7 @@ def _normed(network: ShapedReward, *observations: Array) -> ShapedReward:
 
 
 def _discriminator_updates(
-    discriminator: Discriminator, optimiser: Any, how: Training
+    discriminator: Discriminator, optimiser: Any, how: AdversarialTraining
 ) -> Callable[..., tuple[ShapedReward, Any, Losses]]:
     """All of a round's updates in one compiled program; the losses are those of the last."""
 
@@ -405,6 +405,7 @@ def _discriminator_updates(
             return (optax.apply_updates(parameters, change), memory), met
 
         keys = jax.random.split(k_updates, how.updates)
+        every: Losses
         (parameters, memory), every = lax.scan(step, (_trainable(network), memory), keys)
         return _with(network, parameters), memory, jax.tree.map(lambda x: x[-1], every)
 

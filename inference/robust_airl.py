@@ -23,7 +23,7 @@ from jaxtyping import Array
 
 from ..models.networks import Policy
 from ..models.sensing import GaussianSensor, Recording, ShiftSensor, Truths
-from .airl import Training, adversarial
+from .airl import AdversarialTraining, adversarial
 from .discriminator import Discriminator, ExpertTransitions, Transitions, airl_discriminator
 from .gaussian_truth import GaussianTruth, fitted_sensor
 from .partition_truth import CandidateTruth, fitted_shift_sensor
@@ -140,7 +140,7 @@ def robust_airl(
     sensor: Any,
     *,
     discriminator: Discriminator | None = None,
-    training: Training | None = None,
+    training: AdversarialTraining | None = None,
 ) -> Learner:
     """robust-AIRL with a known sensor.
 
@@ -150,7 +150,7 @@ def robust_airl(
     truth : GaussianTruth, CandidateTruth or PartitionTruth
         With the dynamics: ``gaussian_truth(robot, robot.observation_size)``, say.
     sensor : the sensor behind the reports, such as :class:`GaussianSensor`
-    discriminator, training : by default AIRL's, and :class:`Training`'s own
+    discriminator, training : by default AIRL's, and :class:`AdversarialTraining`'s own
     """
     return _learner("robust-AIRL", generator, Smoothed(truth, sensor), discriminator, training)
 
@@ -162,7 +162,7 @@ def robust_airl_with_sensor(
     fit: Callable[[Any, Any, Policy, Any], Any] = fit_gaussian,
     *,
     discriminator: Discriminator | None = None,
-    training: Training | None = None,
+    training: AdversarialTraining | None = None,
 ) -> Learner:
     """robust-AIRL that learns the sensor's parameters too, from ``sensor`` on; else :func:`robust_airl`."""
     hidden = SmoothedAndFitted(truth, sensor, fit)
@@ -170,7 +170,11 @@ def robust_airl_with_sensor(
 
 
 def _learner(
-    name: str, generator: Any, hidden: Any, discriminator: Discriminator | None, training: Training | None
+    name: str,
+    generator: Any,
+    hidden: Any,
+    discriminator: Discriminator | None,
+    training: AdversarialTraining | None,
 ) -> Learner:
     environment = generator.environment
     if discriminator is None:

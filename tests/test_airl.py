@@ -3,14 +3,14 @@ import numpy as np
 import pytest
 
 from i2rl.domains.control import cart_pole
-from i2rl.inference.airl import Training, adversarial, reported_steps
+from i2rl.inference.airl import AdversarialTraining, adversarial, reported_steps
 from i2rl.inference.discriminator import airl_discriminator, gail_discriminator
 from i2rl.inference.journal import Journal
 from i2rl.inference.ppo import ppo
 from i2rl.inference.session import run_sessions
 from i2rl.models.sensing import Recording, recording
 
-SMALL = Training(rounds=3, updates=2, batch=32)
+SMALL = AdversarialTraining(rounds=3, updates=2, batch=32)
 
 
 @pytest.fixture(scope="module")
@@ -123,7 +123,7 @@ def test_the_pole_is_balanced_by_imitation_alone(task, kind):
         assert not ended
     demonstration = recording([np.array(observations)], [np.array(actions)], n_actions=2)
     agent = ppo(task, n_envs=8, n_steps=128, learning_rate=1e-3, scale_rewards=True)
-    training = Training(rounds=48, updates=16, learning_rate=3e-3)
+    training = AdversarialTraining(rounds=48, updates=16, learning_rate=3e-3)
     learner = adversarial("x", agent, kind(4, task.actions), training=training)
     state, report = learner.update(learner.init(jax.random.key(0)), demonstration)
     random = report.returns[0]

@@ -22,7 +22,7 @@ import numpy as np
 
 from ...domains.control import cart_pole
 from ...domains.locomotion import locomotion
-from ...inference.airl import Training, adversarial
+from ...inference.airl import AdversarialTraining, adversarial
 from ...inference.discriminator import airl_discriminator
 from ...inference.ppo import PPO, ppo
 from ...inference.rollouts import Episodes
@@ -102,7 +102,9 @@ def _learner(agent: PPO, setting: Setting, **training: Any) -> Any:
     # One learner a setting: another would be compiled again.
     if setting not in _LEARNERS:
         environment = agent.environment
-        how = Training(rounds=setting.rounds, updates=setting.updates, batch=setting.batch, **training)
+        how = AdversarialTraining(
+            rounds=setting.rounds, updates=setting.updates, batch=setting.batch, **training
+        )
         discriminator = airl_discriminator(environment.observation_size, environment.actions)
         _LEARNERS[setting] = adversarial("AIRL", agent, discriminator, training=how)
     return _LEARNERS[setting]

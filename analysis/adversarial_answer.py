@@ -1,0 +1,47 @@
+"""What ``i2rl run robust-airl`` does: the study of one task at one level of noise, and its report."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from pathlib import Path
+
+from . import adversarial_study
+from .adversarial_cases import PLANS, Plan
+from .adversarial_report import print_tables, summary, write
+from .adversarial_results import AdversarialResults
+
+__all__ = ["answer", "print_tables", "summary", "write"]
+
+
+def answer(
+    domain: str,
+    seeds: int = 1,
+    sessions: int | None = None,
+    noise: float = 1.0,
+    *,
+    workers: int = 1,
+    kept: Path | None = None,
+    advance: Callable[[str, float | None], None] = lambda text, share: None,
+) -> AdversarialResults:
+    """The study of a task with ``noise`` times its own noise. Raises ``ValueError`` for noise of zero."""
+    if not noise > 0:
+        raise ValueError(f"noise is a multiple, above zero, of the study's own; got {noise}")
+    if domain == "patrol":
+        from .adversarial_patrol import patrol_results
+
+        return patrol_results(seeds, sessions, noise, advance=advance)
+    plan = _scaled(PLANS[domain], noise)
+    if sessions is not None:
+        plan = plan._replace(sessions=sessions)
+    return adversarial_study.study(
+        domain, seeds, plan, workers=workers, folder=kept, machine=_machine(), advance=advance
+    )
+
+
+def _scaled(plan: Plan, noise: float) -> Plan:
+    return plan._replace(covariance=noise * plan.covariance, shift=noise * plan.shift)
+
+
+def _machine() -> str:
+    return f"{os.cpu_count()} processor cores"
