@@ -134,6 +134,9 @@ def fit_noise_curve(
     )
 
 
+AVERAGES = {"mean": np.mean, "median": np.median}
+
+
 def rank(
     environment: Environment | HostEnvironment,
     acting: PPOState,
@@ -141,11 +144,13 @@ def rank(
     levels: Float[np.ndarray, " E"],
     trajectories: int,
     key: Array,
+    average: str = "mean",
 ) -> tuple[NoiseCurve, Ranked]:
     """Act out a policy with noise, and say from the noise alone what each trajectory is worth.
 
     ``trajectories`` whole episodes at each level are scored by the sum of the state rewards ``network``, the
-    reward of the absorbing state counting for what is left of those that terminated.
+    reward of the absorbing state counting for what is left of those that terminated. The curve is fitted to
+    their ``average`` at each level, "mean" or "median".
     """
     k_start, k_roll = jax.random.split(key)
     each = np.repeat(levels, trajectories)
@@ -159,7 +164,8 @@ def rank(
         environment.horizon,
     )
     scores, lengths = _scored(network, noisy)
-    curve = fit_noise_curve(levels, np.asarray(scores, float).reshape(-1, trajectories).mean(1))
+    of_level = np.asarray(scores, float).reshape(-1, trajectories)
+    curve = fit_noise_curve(levels, AVERAGES[average](of_level, 1))
     observations = jnp.swapaxes(noisy.rollout.observations, 0, 1)
     return curve, Ranked(observations, lengths, jnp.asarray(np.repeat(curve.values, trajectories), DTYPE))
 
@@ -193,6 +199,8 @@ class SSRRTraining(NamedTuple):
     trajectories : int, episodes at each
     regression : Regression
     rounds : int, of the second policy, in a session
+    average : "mean" (as released) or "median", of the scores at a level; one episode in which the first
+        reward plunges moves the mean of five a long way
     start : "scratch" (as released, who take a million steps and more) or "first", the second policy as it
         begins: untrained, or a copy of the first as the first session leaves it
     """
@@ -201,6 +209,7 @@ class SSRRTraining(NamedTuple):
     trajectories: int = 5
     regression: Regression = Regression()
     rounds: int = 10
+    average: str = "mean"
     start: str = "scratch"
 
     def checked(self) -> SSRRTraining:
@@ -208,6 +217,8 @@ class SSRRTraining(NamedTuple):
         for name in ("trajectories", "rounds"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if self.average not in AVERAGES:
+            raise ValueError(f"average is one of {', '.join(AVERAGES)}, got {self.average!r}")
         if self.start not in STARTS:
             raise ValueError(f"the second policy starts from one of {', '.join(STARTS)}, got {self.start!r}")
         fit_noise_curve(np.array(self.levels), np.zeros(len(self.levels)))
@@ -322,7 +333,7 @@ def ssrr(
         imitated: AdversarialReport
         imitation, imitated = first.update(state.first, recording)  # type: ignore[arg-type, assignment]
         curve, ranked = rank(
-            environment, imitation.generator, imitation.network, levels, how.trajectories, k_rank
+            environment, imitation.generator, imitation.network, levels, how.trajectories, k_rank, how.average
         )
         network, memory, fit = regress(state.network, state.optimiser, ranked, k_regress)
         acting, returns = state.generator, []

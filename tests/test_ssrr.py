@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from i2rl.inference.discriminator import airl_discriminator
@@ -45,6 +45,7 @@ def test_noise_in_the_returns_moves_the_fit_little():
     assert np.corrcoef(curve.values, shape)[0, 1] > 0.99
 
 
+@settings(max_examples=10)
 @given(st.lists(st.floats(-1e3, 1e3), min_size=20, max_size=20))
 def test_whatever_was_measured_the_curve_falls_within_its_bounds(returns):
     curve = fit_noise_curve(LEVELS, np.array(returns))
@@ -116,8 +117,11 @@ def slid(state, action):
     return jnp.stack([0.9 * state[..., 0] + 0.1 * push, state[..., 1]], -1)
 
 
-def slide(horizon: int, wall: float = np.inf) -> Environment:
-    """A block pushed along; the reward is its place, and beside it is something that does not matter."""
+def slide(horizon: int, wall: float) -> Environment:
+    """A block pushed along; the reward is its place; beside it is something that does not matter.
+
+    It ends at a wall on the left.
+    """
 
     def step(state, action):
         following = slid(state, action)
@@ -139,7 +143,7 @@ def place_reward(slope: float, absorbing: float):
 @pytest.fixture(scope="module")
 def agent():
     settings = {"n_envs": 10, "n_steps": 80, "minibatch": 80, "learning_rate": 1e-3, "log_deviation": -1.0}
-    return ppo(slide(40), scale_rewards=True, **settings)
+    return ppo(slide(40, 0.5), scale_rewards=True, **settings)
 
 
 def pushing(agent, strength):
@@ -150,34 +154,34 @@ def pushing(agent, strength):
 
 def test_trajectories_are_worth_what_their_noise_leaves_of_the_reward(agent):
     curve, ranked = rank(
-        agent.environment, pushing(agent, 0.8), place_reward(2.0, 0.0), LEVELS, 20, jax.random.key(1)
+        agent.environment, pushing(agent, 0.8), place_reward(2.0, 0.0), LEVELS, 5, jax.random.key(1)
     )
-    assert ranked.observations.shape == (400, 40, 2)
+    assert ranked.observations.shape == (100, 40, 2)
     assert (ranked.lengths == 40).all()
-    np.testing.assert_array_equal(ranked.worth, np.repeat(curve.values, 20).astype(np.float32))
-    returns = 2 * np.asarray(ranked.observations)[..., 0].sum(1).reshape(20, 20).mean(1)
+    np.testing.assert_array_equal(ranked.worth, np.repeat(curve.values, 5).astype(np.float32))
+    returns = 2 * np.asarray(ranked.observations)[..., 0].sum(1).reshape(20, 5).mean(1)
     np.testing.assert_allclose(curve.scores, (returns - returns.min()) / np.ptp(returns), atol=1e-4)
     # With probability eps a push is nought on average: the expected place is proportional to 1 - eps.
-    np.testing.assert_allclose(returns / returns[0], 1 - LEVELS, atol=0.15)
+    np.testing.assert_allclose(returns / returns[0], 1 - LEVELS, atol=0.25)
     assert curve.explained > 0.95
 
 
-def test_what_is_left_of_an_episode_that_ended_is_spent_in_the_absorbing_state(agent):
-    environment = slide(40, wall=0.3)
-    levels = np.array([0.0, 0.3, 0.6, 0.9])
+@pytest.mark.parametrize("average", ["mean", "median"])
+def test_what_is_left_of_an_episode_that_ended_is_spent_in_the_absorbing_state(agent, average):
+    network = place_reward(1.0, -2.0)
     curve, ranked = rank(
-        environment, pushing(agent, -0.6), place_reward(1.0, -2.0), levels, 10, jax.random.key(1)
+        agent.environment, pushing(agent, -0.8), network, LEVELS, 5, jax.random.key(1), average
     )
     lengths, place = np.asarray(ranked.lengths), np.asarray(ranked.observations)[..., 0]
     assert (lengths < 40).any()
     assert (lengths == 40).any()
     scores = [x[:n].sum() - 2 * (40 - n) for x, n in zip(place, lengths, strict=True)]
-    returns = np.reshape(scores, (4, 10)).mean(1)
+    returns = getattr(np, average)(np.reshape(scores, (20, 5)), 1)
     np.testing.assert_allclose(curve.scores, (returns - returns.min()) / np.ptp(returns), atol=1e-4)
-    # Before its end no episode was beyond the wall, and the step that ended it led there.
+    # Before its end no episode was beyond the wall, and a push from where it ended could lead there.
     for x, n in zip(place, lengths, strict=True):
-        assert (x[:n] >= -0.3).all()
-        assert n == 40 or x[n - 1] < -0.3 / 0.9 + 0.1 / 0.9
+        assert (x[:n] >= -0.5).all()
+        assert n == 40 or 0.9 * x[n - 1] - 0.1 < -0.5
 
 
 # -- the learner ------------------------------------------------------------------------------------------
@@ -263,8 +267,6 @@ def test_the_second_policy_may_begin_as_the_first(agent, demonstration):
     # An agent that never improves shows what it began as.
     still = agent._replace(improve=lambda state, rollout, rewards: state)
     training = SSRRTraining(
-        levels=(0.0, 0.3, 0.6, 0.9),
-        trajectories=1,
         regression=Regression(hidden=(), members=1, snippets=80, iterations=1, shortest=5, longest=30),
         rounds=1,
         start="first",
@@ -285,6 +287,7 @@ def test_the_second_policy_may_begin_as_the_first(agent, demonstration):
         ({"rounds": 0}, "rounds"),
         ({"trajectories": 0}, "trajectories"),
         ({"levels": (0.0, 0.5)}, "four levels"),
+        ({"average": "mode"}, "mean, median"),
         ({"start": "last"}, "scratch, first"),
         ({"regression": Regression(members=0)}, "members"),
     ],
