@@ -7,7 +7,7 @@ odd steps the even ones are independent, and given the states so are the actions
 of everything at once. With affine dynamics and policy every proposal is accepted.
 
 Neighbours that follow each other closely (small ``Q``) move each other slowly: the smoother of
-:mod:`.gaussian_truth` is the default, and this its check.
+:mod:`.gaussian_truth` is the default, and this its check. Bounds are not imposed here.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float
 
 from ..models.sensing import GaussianSensor, Recording, Truths, log_normal, truths
-from .gaussian_truth import GaussianTruth, JaxDynamics, Model, linear_policy, policy_moments
+from .gaussian_truth import GaussianTruth, JaxDynamics, Model, policy_moments
 
 
 class GibbsChain(NamedTuple):
@@ -88,13 +88,20 @@ def _pull_back(model: Model, blanket: _Blanket, at: _Tangent) -> tuple[Array, Ar
     return pulled @ slope, jnp.einsum("nij,nj->ni", pulled, target)
 
 
+def _tangent_policy(policy: Any, observations: Float[Array, "N d"]) -> tuple[Array, Array, Array]:
+    """Mean ``[N, k]``, its derivative ``[N, k, d]`` and covariance ``[N, k, k]`` at each observation."""
+    means, covariances = policy_moments(policy, observations)
+    slopes = jax.vmap(jax.jacfwd(lambda s: policy_moments(policy, s)[0]))(observations)
+    return means, slopes, covariances
+
+
 def _state_law(
     model: Model, policy: Any, sensor: GaussianSensor, blanket: _Blanket, at: _Tangent
 ) -> tuple[Array, Array]:
     """Precision and information of a state: T1, T3, T4 and, through the slope of the policy, T2."""
     mean, covariance = _law_of_start(model, blanket)
     prior, read = _inverse(covariance), _inverse(sensor.state_covariance)
-    mu, K, sigma = linear_policy(policy, at.value)
+    mu, K, sigma = _tangent_policy(policy, at.value)
     through = K.swapaxes(-1, -2) @ _inverse(sigma)
     target = blanket.other - mu + jnp.einsum("nij,nj->ni", K, at.value)
     precision, information = _pull_back(model, blanket, at)

@@ -24,6 +24,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.linalg import solve_triangular
+from jax.scipy.stats import norm
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from ..models.sensing import (
@@ -51,6 +52,9 @@ CAUTION = ((1.0, 30.0), (3.0, 20.0), (2.0, 10.0), (1.5, 5.0), (1.0, 3.0))
 """Of the first passes and, the last of them, of all later ones: by how much the posterior is widened before
 differences are taken across it, and by how much what they leave over counts (they see each axis, not how axes
 bend together). Nothing where the dynamics are affine."""
+
+_FAR = 30.0  # deviations from a bound at which it makes no difference
+_LEAST_DEVIATION = 0.03
 
 _REACH = 3.0**0.5  # in deviations: matches a Gaussian's fourth moment
 
@@ -135,17 +139,56 @@ def policy_moments(policy: Any, observations: Float[Array, "... d"]) -> tuple[Ar
     return mean.astype(float), covariance.astype(float)
 
 
-def linear_policy(policy: Any, observations: Float[Array, "N d"]) -> tuple[Array, Array, Array]:
-    """Mean ``[N, k]``, its derivative ``[N, k, d]`` and covariance ``[N, k, k]`` at each observation."""
+def executed_moments(policy: Any, bounds: Bounds, observations: Float[Array, "... d"]) -> tuple[Array, Array]:
+    """Mean and covariance of a policy's action once it is cut to its bounds, as environments do.
 
-    def mean(s: Array) -> Array:
-        return policy_moments(policy, s)[0]
+    A policy whose mean lies far outside means the bound, and says nothing of the state. Components are those
+    of a censored normal; their correlations are kept. Without bounds :func:`policy_moments`.
+    """
+    mean, covariance = policy_moments(policy, observations)
+    if bounds.low.ndim == 0:
+        return mean, covariance
+    d = observations.shape[-1]
+    sd = jnp.sqrt(jnp.diagonal(covariance, axis1=-2, axis2=-1))
+    low = jnp.clip((bounds.low[d:] - mean) / sd, -_FAR, _FAR)
+    high = jnp.clip((bounds.high[d:] - mean) / sd, -_FAR, _FAR)
+    below, above = norm.cdf(low), norm.sf(high)
+    inside = 1 - below - above
+    first = low * below + high * above + norm.pdf(low) - norm.pdf(high)
+    second = low**2 * below + high**2 * above + inside + low * norm.pdf(low) - high * norm.pdf(high)
+    share = jnp.sqrt(jnp.maximum(second - first**2, 0.0))
+    # A certain action would leave the slopes of its step no room for error.
+    least = _LEAST_DEVIATION**2 * jnp.eye(sd.shape[-1])
+    cut = jnp.clip(mean + sd * first, bounds.low[d:], bounds.high[d:])
+    return cut, share[..., None] * covariance * share[..., None, :] + least
 
-    means, covariances = policy_moments(policy, observations)
-    return means, jax.vmap(jax.jacfwd(mean))(observations), covariances
+
+def _caution(passes: Array) -> tuple[Array, Array]:
+    widening, count = jnp.asarray(CAUTION)[jnp.minimum(passes, len(CAUTION) - 1)]
+    return widening, count
 
 
-def _affine_chains(model: Model, policy: Any, sensor: GaussianSensor, chain: TruthChain) -> AffineGaussian:
+def _points(centre: Float[Array, "... D"], covariance: Float[Array, "... D D"]) -> tuple[Array, Array]:
+    """A Cholesky factor, and the centre and both ends of each axis, ``[..., 1 + 2 D, D]``."""
+    slack = 1e-14 * jnp.trace(covariance, axis1=-2, axis2=-1)[..., None, None] * jnp.eye(centre.shape[-1])
+    factor = jnp.linalg.cholesky(covariance + slack)
+    axes, middle = _REACH * factor.swapaxes(-1, -2), centre[..., None, :]
+    return factor, jnp.concatenate([middle, middle + axes, middle - axes], -2)
+
+
+def _differences(factor: Array, values: Float[Array, "... P m"]) -> tuple[Array, Array, Array]:
+    """Mean ``[..., m]``, slope ``[..., m, D]`` and covariance of the rest of values at :func:`_points`."""
+    D = factor.shape[-1]
+    middle, up, down = values[..., 0, :], values[..., 1 : D + 1, :], values[..., D + 1 :, :]
+    bend = up + down - 2 * middle[..., None, :]
+    slope = solve_triangular(factor, (up - down) / (2 * _REACH), trans=1, lower=True).swapaxes(-1, -2)
+    rest = (_REACH**2 - 1) / (4 * _REACH**4) * jnp.einsum("...ai,...aj->...ij", bend, bend)
+    return middle + bend.sum(-2) / (2 * _REACH**2), slope, rest
+
+
+def _affine_chains(
+    model: Model, bounds: Bounds, policy: Any, sensor: GaussianSensor, chain: TruthChain
+) -> AffineGaussian:
     """The chain of pairs ``(s, a)``, linearised; every field with a leading ``n``.
 
     The action is drawn from the state it is taken in: ``a' = mu + K (s' - s0') + N(0, Sigma)``, hence
@@ -153,8 +196,10 @@ def _affine_chains(model: Model, policy: Any, sensor: GaussianSensor, chain: Tru
     """
     n, length, d, D = chain.slope.shape
     states = chain.centre[..., :d]
-    linear = linear_policy(policy, states.reshape(-1, d))
-    mu, K, sigma = (x.reshape(n, length, *x.shape[1:]) for x in linear)
+    factor, points = _points(states, chain.covariances[..., :d, :d])
+    mean, covariance = executed_moments(policy, bounds, points)
+    mu, K, rest = _differences(factor, mean)
+    sigma = covariance[..., 0, :, :] + _caution(chain.passes - 1)[1] * rest
     intercept = mu - jnp.einsum("ntkd,ntd->ntk", K, states)
     lift = jnp.concatenate([jnp.broadcast_to(jnp.eye(d), (n, length, d, d)), K], 2)
     start = chain.following - jnp.einsum("ntij,ntj->nti", chain.slope, chain.centre)
@@ -180,8 +225,10 @@ def _affine_chains(model: Model, policy: Any, sensor: GaussianSensor, chain: Tru
 
 
 @jax.jit
-def _filter(model: Model, policy: Any, sensor: GaussianSensor, chain: TruthChain) -> GaussianFiltered:
-    chains = _affine_chains(model, policy, sensor, chain)
+def _filter(
+    model: Model, bounds: Bounds, policy: Any, sensor: GaussianSensor, chain: TruthChain
+) -> GaussianFiltered:
+    chains = _affine_chains(model, bounds, policy, sensor, chain)
     reports = jnp.concatenate([chain.reported.observations, chain.reported.actions], -1)
     return lax.map(lambda x: filter_gaussian(*x), (chains, reports, chain.reported.live))
 
@@ -205,29 +252,19 @@ def _axes(bounds: Bounds, sensor: GaussianSensor, chain: TruthChain) -> tuple[Ar
         jnp.concatenate([jnp.diagonal(sensor.state_covariance), jnp.diagonal(sensor.action_covariance)])
     )
     near = jnp.clip(chain.means, reports - radius, reports + radius)
-    centre = jnp.clip(near, bounds.low, bounds.high)[:, :, None]
-    widening = jnp.asarray(CAUTION)[jnp.minimum(chain.passes, len(CAUTION) - 1), 0]
-    spread = widening * chain.covariances
-    slack = 1e-14 * jnp.trace(spread, axis1=-2, axis2=-1)[..., None, None] * jnp.eye(spread.shape[-1])
-    factor = jnp.linalg.cholesky(spread + slack)
-    axes = _REACH * factor.swapaxes(-1, -2)
-    return centre[:, :, 0], factor, jnp.concatenate([centre, centre + axes, centre - axes], 2)
+    centre = jnp.clip(near, bounds.low, bounds.high)
+    return centre, *_points(centre, _caution(chain.passes)[0] * chain.covariances)
 
 
 @jax.jit
 def _across(chain: TruthChain, centre: Array, factor: Array, values: Float[Array, "n L P d"]) -> TruthChain:
     """The affine function through the values at the points of :func:`_axes`."""
-    D = centre.shape[-1]
-    middle, up, down = values[:, :, 0], values[:, :, 1 : D + 1], values[:, :, D + 1 :]
-    by_axis = (up - down) / (2 * _REACH)
-    bend = up + down - 2 * middle[:, :, None]
-    count = jnp.asarray(CAUTION)[jnp.minimum(chain.passes, len(CAUTION) - 1), 1]
-    weight = count * (_REACH**2 - 1) / (4 * _REACH**4)
+    following, slope, rest = _differences(factor, values)
     return chain._replace(
-        following=middle + bend.sum(2) / (2 * _REACH**2),
-        slope=solve_triangular(factor, by_axis, trans=1, lower=True).swapaxes(-1, -2),
+        following=following,
+        slope=slope,
         centre=centre,
-        remainder=weight * jnp.einsum("ntai,ntaj->ntij", bend, bend),
+        remainder=_caution(chain.passes)[1] * rest,
         passes=chain.passes + 1,
     )
 
@@ -305,19 +342,19 @@ class GaussianTruth(NamedTuple):
         for _ in range(passes):
             centre, factor, points = _axes(self.bounds, sensor, chain)
             chain = _across(chain, centre, factor, self._next_states(chain.reported, points))
-            filtered = _filter(self.model, policy, sensor, chain)
+            filtered = _filter(self.model, self.bounds, policy, sensor, chain)
             smoothed = _smooth(filtered)
             chain = chain._replace(means=smoothed.means, covariances=smoothed.covariances)
         return chain, _bounded_truths(self.bounds, chain.reported, _draw(key, filtered, self.draws))
 
     def resample(self, chain: TruthChain, policy: Any, key: Array, sensor: GaussianSensor) -> Truths:
         """Draws with the dynamics as last linearised; one :meth:`refresh` must have gone before."""
-        filtered = _filter(self.model, policy, self._sized(sensor, chain), chain)
+        filtered = _filter(self.model, self.bounds, policy, self._sized(sensor, chain), chain)
         return _bounded_truths(self.bounds, chain.reported, _draw(key, filtered, self.draws))
 
     def posterior(self, chain: TruthChain, policy: Any, sensor: GaussianSensor) -> GaussianSmoothed:
         """Moments of the pairs ``(s, a)``, with the dynamics as last linearised, and the log-likelihood."""
-        return _smooth(_filter(self.model, policy, self._sized(sensor, chain), chain))
+        return _smooth(_filter(self.model, self.bounds, policy, self._sized(sensor, chain), chain))
 
     def estimate(self, chain: TruthChain) -> tuple[Float[Array, "n L d"], Float[Array, "n L k"]]:
         """Posterior means of states and actions, within the bounds."""
@@ -372,7 +409,8 @@ def gaussian_truth(
         ``Q``: how far a step may be from what the dynamics say.
     initial_mean, initial_covariance : ``[d]`` (zeros by default); number, ``[d]`` or ``[d, d]``
     observation_bounds, action_bounds : pairs of ``[d]`` and of ``[k]``, or None
-        Between which the truth lies: estimates and draws are cut to them. Both or neither.
+        Between which the truth lies: estimates and draws are cut to them, and the policy's actions are
+        believed to be (:func:`executed_moments`). Both or neither.
     draws : int, ``M``
 
     Raises

@@ -10,7 +10,14 @@ import numpy as np
 import pytest
 
 from i2rl.inference.gaussian_gibbs import GaussianGibbs
-from i2rl.inference.gaussian_truth import fitted_sensor, gaussian_truth, jax_dynamics, log_joint
+from i2rl.inference.gaussian_truth import (
+    Bounds,
+    executed_moments,
+    fitted_sensor,
+    gaussian_truth,
+    jax_dynamics,
+    log_joint,
+)
 from i2rl.inference.serialization import decode, encode, restore
 from i2rl.models.networks import ActionSpace, GaussianPolicy
 from i2rl.models.sensing import GaussianSensor, distort, log_normal, recording
@@ -135,13 +142,13 @@ def test_the_smoother_is_exact_on_affine_problems():
 
 def test_draws_have_the_posterior_and_their_own_successors():
     reported = affine_problem()
-    truth = affine_truth(draws=4000)
+    truth = affine_truth(draws=20_000)
     _, drawn = truth.refresh(truth.init(reported, SENSOR), POLICY, KEY, SENSOR)
     pairs = np.asarray(jnp.concatenate([drawn.observations, drawn.actions], -1))
     for i, length in enumerate(reported.lengths):
         mean, covariance, _ = least_squares(reported, i)
         spread = np.sqrt(np.einsum("titi->ti", covariance))
-        assert (abs(pairs[:, i, :length].mean(0) - mean) < 5 * spread / np.sqrt(4000)).all()
+        assert (abs(pairs[:, i, :length].mean(0) - mean) < 5 * spread / np.sqrt(20_000)).all()
         np.testing.assert_array_equal(
             drawn.successors[:, i, : length - 1], drawn.observations[:, i, 1:length]
         )
@@ -150,11 +157,11 @@ def test_draws_have_the_posterior_and_their_own_successors():
 
 def test_gibbs_accepts_everything_and_agrees_with_the_closed_form_on_affine_problems():
     reported = affine_problem()
-    gibbs = GaussianGibbs(affine_truth(draws=200), sweeps=1)
+    gibbs = GaussianGibbs(affine_truth(draws=250), sweeps=1)
     chain = gibbs.init(reported)
     kept = []
-    for i, key in enumerate(jax.random.split(KEY, 160)):
-        chain, _ = gibbs.refresh(chain, POLICY, key, SENSOR)
+    for i in range(160):
+        chain, _ = gibbs.refresh(chain, POLICY, jax.random.fold_in(KEY, i), SENSOR)
         if i >= 40:
             kept.append(np.asarray(jnp.concatenate([chain.observations, chain.actions], -1)))
     assert chain.accepted == chain.proposed > 0
@@ -186,8 +193,8 @@ def test_smoother_gibbs_and_importance_sampling_agree_on_a_pendulum():
     posterior = truth.posterior(chain, policy, sensor)
     gibbs = GaussianGibbs(truth._replace(draws=250), sweeps=1)
     walk, total = gibbs.init(reported), 0
-    for i, key in enumerate(jax.random.split(KEY, 180)):
-        walk, _ = gibbs.refresh(walk, policy, key, sensor)
+    for i in range(180):
+        walk, _ = gibbs.refresh(walk, policy, jax.random.fold_in(KEY, i), sensor)
         if i >= 60:
             total += np.asarray(jnp.concatenate([walk.observations, walk.actions], -1)) / 120
     assert 0.8 < walk.accepted / walk.proposed < 1
@@ -223,7 +230,7 @@ def test_smoother_gibbs_and_importance_sampling_agree_on_a_pendulum():
 def test_smoothing_brings_a_pendulum_nearer_to_the_truth_and_knows_how_near():
     sensor = GaussianSensor(0.1, 0.05)
     policy, true, reported = pendulum_problem([30] * 19 + [12], sensor)
-    truth = gaussian_truth(PENDULUM, d, process_covariance=1e-2)
+    truth = gaussian_truth(PENDULUM, d, process_covariance=1e-2, draws=1)
     chain, _ = truth.refresh(truth.init(reported, sensor), policy, KEY, sensor, passes=5)
     live = np.asarray(true.live)
 
@@ -301,19 +308,31 @@ def test_the_em_algorithm_finds_the_covariances_of_a_pendulums_sensor():
     truth = gaussian_truth(PENDULUM, d, process_covariance=1e-2, draws=1)
     learned = GaussianSensor(0.3, 0.3).sized(d, k)
     chain = truth.init(reported, learned)
-    for key in jax.random.split(KEY, 25):
-        chain, _ = truth.refresh(chain, policy, key, learned)
+    for _ in range(25):
+        chain, _ = truth.refresh(chain, policy, KEY, learned)
         learned = fitted_sensor(reported, truth.posterior(chain, policy, learned))
     np.testing.assert_allclose(jnp.diagonal(learned.state_covariance), 0.1, rtol=0.2)
     np.testing.assert_allclose(learned.action_covariance, 0.1, rtol=0.2)
 
 
+def test_an_action_that_is_cut_to_its_bounds_has_the_moments_of_what_is_executed():
+    policy = AffinePolicy(jnp.array([[1.0, 0.0]]), jnp.array([0.0]), jnp.array([[0.3]]))
+    bounds = Bounds(jnp.array([-9.0, -9.0, -0.5]), jnp.array([9.0, 9.0, 1.0]))
+    states = jnp.array([[0.2, 0.0], [-0.6, 0.0], [1.3, 0.0], [20.0, 0.0]])
+    mean, covariance = executed_moments(policy, bounds, states)
+    raw = states[:, 0] + 0.3**0.5 * np.random.default_rng(0).normal(size=(400_000, 4))
+    executed = np.clip(raw, -0.5, 1.0)
+    np.testing.assert_allclose(mean[:, 0], executed.mean(0), atol=5 * 0.5 / np.sqrt(400_000))
+    np.testing.assert_allclose(covariance[:, 0, 0], executed.var(0) + 0.03**2, atol=2e-3)
+
+
 def test_a_chain_survives_its_storage_and_resampling_draws_the_same_from_it():
     reported = affine_problem()
     truth = affine_truth()
-    chain, drawn = truth.refresh(truth.init(reported, SENSOR), POLICY, KEY, SENSOR)
-    stored = restore(decode(encode(chain)), chain)
-    for one, other in zip(drawn, truth.resample(stored, POLICY, KEY, SENSOR), strict=True):
+    chain, _ = truth.refresh(truth.init(reported, SENSOR), POLICY, KEY, SENSOR)
+    stored = restore(decode(encode(chain)), truth.init(reported, SENSOR))
+    drawn, again = (truth.resample(c, POLICY, KEY, SENSOR) for c in (chain, stored))
+    for one, other in zip(drawn, again, strict=True):
         np.testing.assert_array_equal(one, other)
 
 
