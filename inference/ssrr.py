@@ -11,7 +11,7 @@ far from what the expert was after (section 2.3.3).
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -134,7 +134,7 @@ def fit_noise_curve(
     )
 
 
-AVERAGES = {"mean": np.mean, "median": np.median}
+AVERAGES: dict[str, Callable[..., np.ndarray]] = {"mean": np.mean, "median": np.median}
 
 
 def rank(
