@@ -31,7 +31,7 @@ WORTH = 10.0
 class Regression(NamedTuple):
     """How rewards are regressed on snippets; the defaults are those released, and take many minutes.
 
-    Less of everything: ``hidden=(64, 64), points=32, iterations=500, learning_rate=1e-3, deviation=0.1``. Few
+    Less of everything: ``hidden=(64, 64), points=32, learning_rate=1e-3, deviation=0.1``. Few
     and narrow layers need larger first weights than the released, from which they do not get away.
 
     Fields
