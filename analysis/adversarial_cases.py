@@ -19,8 +19,8 @@ from ..domains.locomotion import ROBOTS, locomotion
 from ..domains.onion_reaching import OnionMover, demonstrate_onions, onion_reaching
 from ..domains.simulation import simulate
 from ..inference.gaussian_truth import gaussian_truth, jax_dynamics
+from ..inference.hidden_truth import fit_gaussian, fit_shift
 from ..inference.partition_truth import candidate_truth
-from ..inference.robust_airl import fit_gaussian, fit_shift
 from ..models.sensing import MOUNTAIN_CAR_SHIFT, GaussianSensor, Recording, ShiftSensor
 from .adversarial_metrics import accuracy_of_cells, behaviour_accuracies
 

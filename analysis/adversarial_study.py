@@ -25,11 +25,11 @@ from jaxtyping import Array, ArrayLike, Float, Int
 from ..domains.experts import load_demonstrations
 from ..domains.locomotion import ROBOTS, locomotion
 from ..domains.simulation import LEVELS, Perturbed, Trajectories, graded_mix, simulate
-from ..inference.airl import AdversarialTraining, adversarial
+from ..inference.adversarial_learner import AdversarialTraining, adversarial
 from ..inference.discriminator import airl_discriminator
+from ..inference.hidden_truth import Smoothed, robust_airl, robust_airl_with_sensor
 from ..inference.noisy_airl import NoisyTraining
 from ..inference.ppo import ppo
-from ..inference.robust_airl import Smoothed, robust_airl, robust_airl_with_sensor
 from ..inference.session import Learner
 from ..inference.snippet_regression import Regression
 from ..inference.ssrr import SSRRTraining, ssrr
@@ -116,14 +116,14 @@ def learner(name: str, method: str, plan: Plan) -> Learner:
         agent,
         airl_discriminator(task.observation_size, task.actions, agent.settings.gamma, state_only=True),
         NoisyTraining(rounds=half, updates=plan.updates, batch=plan.batch),
-        SSRRTraining(_SSRR_LEVELS, 1, _REGRESSION, rounds=half),
+        SSRRTraining(_SSRR_LEVELS, 1, _REGRESSION, rounds=half, start="first"),
     )
 
 
 _DRAWS = 4
-_SSRR_LEVELS = tuple(0.1 * i for i in range(10))
+_SSRR_LEVELS = tuple(0.05 * i for i in range(16))
 _REGRESSION = Regression(
-    hidden=(64, 64), points=32, iterations=500, learning_rate=1e-3, deviation=0.1
+    hidden=(64, 64), points=32, iterations=200, learning_rate=1e-3, deviation=0.1
 )  # of a session, the networks being carried on
 
 

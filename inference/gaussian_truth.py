@@ -337,7 +337,12 @@ class GaussianTruth(NamedTuple):
     def refresh(
         self, chain: TruthChain, policy: Any, key: Array, sensor: GaussianSensor, passes: int = 1
     ) -> tuple[TruthChain, Truths]:
-        """Draws ``[M, n, L, .]`` after so many passes: 5 or more at first, then one a call will do."""
+        """Draws ``[M, n, L, .]`` after so many passes: 5 or more at first, then one a call will do.
+
+        Raises ``ValueError`` for fewer than one pass (:meth:`resample` draws without).
+        """
+        if passes < 1:
+            raise ValueError(f"passes must be at least 1, got {passes}")
         sensor = self._sized(sensor, chain)
         for _ in range(passes):
             centre, factor, points = _axes(self.bounds, sensor, chain)

@@ -29,7 +29,7 @@ from ..models.environment import Environment, HostEnvironment, Rollout
 from ..models.extras import required
 from ..models.networks import DTYPE, MLP, ActionSpace, Policy, ShapedReward
 from ..models.sensing import Recording
-from .airl import (
+from .adversarial_learner import (
     AdversarialReport,
     AdversarialState,
     Task,

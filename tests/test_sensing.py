@@ -76,7 +76,7 @@ def test_a_covariance_that_is_none_is_refused(covariance, message):
 
 
 def test_a_covariance_of_the_wrong_size_is_refused():
-    with pytest.raises(ValueError, match="state covariance .* 3 components"):
+    with pytest.raises(ValueError, match=r"state covariance .* 3 components"):
         GaussianSensor([1.0, 2.0], 1.0).log_prob(*(jnp.zeros(3), jnp.zeros(1)) * 2)
 
 

@@ -22,7 +22,7 @@ import numpy as np
 
 from ...domains.control import cart_pole
 from ...domains.locomotion import locomotion
-from ...inference.airl import AdversarialTraining, adversarial
+from ...inference.adversarial_learner import AdversarialTraining, adversarial
 from ...inference.discriminator import airl_discriminator
 from ...inference.ppo import PPO, ppo
 from ...inference.rollouts import Episodes

@@ -31,7 +31,9 @@ from .discriminator import (
     ExpertTransitions,
     Losses,
     Transitions,
+    airl_discriminator,
     cross_entropy,
+    gail_discriminator,
     gradient_penalty,
 )
 from .rollouts import finished_returns
@@ -297,8 +299,29 @@ def adversarial(
         )
         return state, report
 
-    settings = {"discriminator": discriminator.name, **how._asdict(), **dict(configuration or {})}
+    settings = {
+        "discriminator": discriminator.name,
+        "agent": generator.settings._asdict(),
+        **how._asdict(),
+        **dict(configuration or {}),
+    }
     return Learner(name, task, settings, init, update)  # type: ignore[arg-type]
+
+
+def airl(generator: Any, *, training: AdversarialTraining | None = None, **networks: Any) -> Learner:
+    """AIRL that takes reports for the truth; ``networks`` goes to :func:`airl_discriminator`."""
+    task = generator.environment
+    networks.setdefault("discount", generator.settings.gamma)
+    discriminator = airl_discriminator(task.observation_size, task.actions, **networks)
+    return adversarial("AIRL", generator, discriminator, training=training)
+
+
+def gail(generator: Any, *, training: AdversarialTraining | None = None, **networks: Any) -> Learner:
+    """GAIL that takes reports for the truth; ``networks`` goes to :func:`gail_discriminator`."""
+    task = generator.environment
+    networks.setdefault("discount", generator.settings.gamma)
+    discriminator = gail_discriminator(task.observation_size, task.actions, **networks)
+    return adversarial("GAIL", generator, discriminator, training=training)
 
 
 # -- a round's parts ------------------------------------------------------------------------------------

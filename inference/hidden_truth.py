@@ -1,6 +1,6 @@
 """robust-AIRL for continuous tasks (section 6.2, Algorithm 3): the truth behind reports, under the policy.
 
-What is done about noise is one object, the learner's :class:`~i2rl.inference.airl.Truth`:
+What is done about noise is one object, the learner's :class:`~i2rl.inference.adversarial_learner.Truth`:
 
 :class:`Smoothed`
     the sensor is known, as the dissertation has it;
@@ -23,7 +23,7 @@ from jaxtyping import Array
 
 from ..models.networks import Policy
 from ..models.sensing import GaussianSensor, Recording, ShiftSensor, Truths
-from .airl import AdversarialTraining, adversarial
+from .adversarial_learner import AdversarialTraining, adversarial
 from .discriminator import Discriminator, ExpertTransitions, Transitions, airl_discriminator
 from .gaussian_truth import GaussianTruth, fitted_sensor
 from .partition_truth import CandidateTruth, fitted_shift_sensor
@@ -88,7 +88,7 @@ class SmoothedAndFitted(NamedTuple):
     sensor: Any
     fit: Callable[[Any, Any, Policy, Any], Any]
     passes: int = 6
-    steps: int = 4
+    steps: int = 10
 
     def prior(self) -> Any:
         """What is believed of the sensor before the first session."""
@@ -146,7 +146,7 @@ def robust_airl(
 
     Parameters
     ----------
-    generator : PPO, or as :func:`~i2rl.inference.airl.adversarial` takes it
+    generator : PPO, or as :func:`~i2rl.inference.adversarial_learner.adversarial` takes it
     truth : GaussianTruth, CandidateTruth or PartitionTruth
         With the dynamics: ``gaussian_truth(robot, robot.observation_size)``, say.
     sensor : the sensor behind the reports, such as :class:`GaussianSensor`

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from i2rl.domains.control import cart_pole
-from i2rl.inference.airl import AdversarialTraining, adversarial, reported_steps
+from i2rl.inference.adversarial_learner import AdversarialTraining, adversarial, reported_steps
 from i2rl.inference.discriminator import airl_discriminator, gail_discriminator
 from i2rl.inference.journal import Journal
 from i2rl.inference.ppo import ppo
