@@ -190,10 +190,7 @@ class ShapedReward(eqx.Module):
 
     def __call__(self, observations: Float[Array, "... d"], actions: ArrayLike) -> Float[Array, "..."]:
         """The reward ``g(s, a)`` itself."""
-        x = self.norm(observations)
-        if not self.state_only:
-            x = jnp.concatenate([x, self.actions.encode(actions)], -1)
-        return self.reward(x)[..., 0]
+        return self.reward_at(self.norm(observations), self.actions.encode(actions))
 
     def shaped(
         self,
@@ -203,9 +200,23 @@ class ShapedReward(eqx.Module):
         terminated: ArrayLike,
     ) -> Float[Array, "..."]:
         """``f(s, a, s')``, the potential of what follows termination being zero."""
-        following = jnp.where(terminated, 0.0, self.potential(self.norm(successors))[..., 0])
-        here = self.potential(self.norm(observations))[..., 0]
-        return self(observations, actions) + self.discount * following - here
+        z, following = self.norm(observations), self.norm(successors)
+        return self.shaped_at(z, self.actions.encode(actions), following, jnp.asarray(terminated))
+
+    def reward_at(self, z: Float[Array, "... d"], a: Float[Array, "... size"]) -> Float[Array, "..."]:
+        """``g`` of a scaled observation and an encoded action."""
+        return self.reward(z if self.state_only else jnp.concatenate([z, a], -1))[..., 0]
+
+    def shaped_at(
+        self,
+        z: Float[Array, "... d"],
+        a: Float[Array, "... size"],
+        following: Float[Array, "... d"],
+        terminated: Array,
+    ) -> Float[Array, "..."]:
+        """``f`` of scaled observations and encoded actions."""
+        after = jnp.where(terminated, 0.0, self.potential(following)[..., 0])
+        return self.reward_at(z, a) + self.discount * after - self.potential(z)[..., 0]
 
 
 class GaussianPolicy(eqx.Module):
