@@ -80,7 +80,7 @@ class Case(NamedTuple):
     expert_return : float
     sensor, assumed : the sensor, and what is believed of it where it is learned
     noise : str, the sensor in words
-    truth : ``(draws) -> GaussianTruth`` or a like object
+    truth : ``(draws=) -> GaussianTruth`` or a like object
     fit : ``(truth, chain, policy, sensor) -> sensor``
     accuracy : ``(policy, key) -> LBA``
     accuracy_over : str, in words
@@ -99,7 +99,7 @@ class Case(NamedTuple):
     sensor: Any
     assumed: Any
     noise: str
-    truth: Callable[[int], Any]
+    truth: Callable[..., Any]
     fit: Callable
     accuracy: Callable[[Any, Array], float]
     accuracy_over: str

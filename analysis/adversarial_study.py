@@ -104,10 +104,12 @@ def learner(name: str, method: str, plan: Plan) -> Learner:
     if method in (CLEAN, NOISY):
         return adversarial("AIRL", agent, discriminator, training=training)
     if method == ROBUST:
-        return robust_airl(agent, of.truth(_DRAWS), of.sensor, discriminator=discriminator, training=training)
+        return robust_airl(
+            agent, of.truth(draws=_DRAWS), of.sensor, discriminator=discriminator, training=training
+        )
     if method == LEARNED:
         return robust_airl_with_sensor(
-            agent, of.truth(_DRAWS), of.assumed, of.fit, discriminator=discriminator, training=training
+            agent, of.truth(draws=_DRAWS), of.assumed, of.fit, discriminator=discriminator, training=training
         )
     # The same steps in all: ranking takes some, and the rest is halved between imitation and the end.
     ranking = len(_SSRR_LEVELS) * task.horizon / agent.settings.steps
@@ -220,8 +222,8 @@ def _belief(of: Case, policy: Any, truth: Recording, reported: Recording) -> Bel
         observations, actions, live = (x[:1, :steps] for x in recording[:3])
         return Recording(observations, actions, live, jnp.zeros(1, bool))
 
-    begun = Smoothed(of.truth(64), of.sensor).begin(first(reported), of.sensor, jax.random.key(0))
-    _, drawn = Smoothed(of.truth(64), of.sensor).refresh(begun, of.sensor, policy, jax.random.key(0))
+    begun = Smoothed(of.truth(draws=64), of.sensor).begin(first(reported), of.sensor, jax.random.key(0))
+    _, drawn = Smoothed(of.truth(draws=64), of.sensor).refresh(begun, of.sensor, policy, jax.random.key(0))
     d = truth.observations.shape[-1]
 
     def picked(observations: Any, actions: Any) -> np.ndarray:
