@@ -225,8 +225,7 @@ def adversarial(
     task = Task(environment.name, environment.observation_size, environment.actions)
     truth = FaceValue() if truth is None else truth
     how = (training or AdversarialTraining()).checked()
-    optimiser = optax.adam(how.learning_rate)
-    trained = _discriminator_updates(discriminator, optimiser, how)
+    start, trained = discriminator_updates(discriminator, how)
 
     @jax.jit
     def rewarded(network: ShapedReward, policy: Policy, rollout: Any) -> Float[Array, "T n"]:
@@ -243,7 +242,7 @@ def adversarial(
         acting = generator.init(k_generator)
         blank = _blank(task, (how.replay, generator.settings.steps))
         zero = jnp.zeros((), jnp.int64)
-        parts = (network, optimiser.init(_trainable(network)), acting, blank, zero, zero, truth.prior())
+        parts = (network, start(network), acting, blank, zero, zero, truth.prior())
         return AdversarialState(zero, k_rest, *parts)
 
     def update(state: AdversarialState, recording: Recording) -> tuple[AdversarialState, AdversarialReport]:
@@ -378,10 +377,19 @@ def _normed(network: ShapedReward, *observations: Array) -> ShapedReward:
     return eqx.tree_at(lambda net: net.norm, network, norm)
 
 
-def _discriminator_updates(
-    discriminator: Discriminator, optimiser: Any, how: AdversarialTraining
-) -> Callable[..., tuple[ShapedReward, Any, Losses]]:
-    """All of a round's updates in one compiled program; the losses are those of the last."""
+def discriminator_updates(
+    discriminator: Discriminator, how: AdversarialTraining
+) -> tuple[Callable[[ShapedReward], Any], Callable[..., tuple[ShapedReward, Any, Losses]]]:
+    """The optimiser's first state, and all of a round's updates in one compiled program.
+
+    The second is ``(network, memory, policy, expert, replay, filled, key) -> (network, memory, losses)``:
+    ``expert`` is :class:`ExpertTransitions`, ``replay`` generated steps ``[K, B, ...]`` of which the first
+    ``filled`` rounds count, and the losses are those of the last update.
+    """
+    optimiser = optax.adam(how.learning_rate)
+
+    def start(network: ShapedReward) -> Any:
+        return optimiser.init(_trainable(network))
 
     @jax.jit
     def trained(
@@ -432,4 +440,4 @@ def _discriminator_updates(
         (parameters, memory), every = lax.scan(step, (_trainable(network), memory), keys)
         return _with(network, parameters), memory, jax.tree.map(lambda x: x[-1], every)
 
-    return trained
+    return start, trained
