@@ -41,7 +41,11 @@ from .sorting import (
 from .sorting_line import Line, Tally, sort_belts
 from .swap_noise import SwapNoise
 
-_HOMES = {"control": ("cart_pole", "mountain_car")}
+_HOMES = {
+    "control": ("cart_pole", "mountain_car"),
+    "experts": ("load_demonstrations", "load_expert"),
+    "onion_recordings": ("read_onion_recordings", "write_onion_recordings"),
+}
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 __all__ = [
     "Bout",

@@ -7,6 +7,23 @@ import importlib
 from typing import Any
 
 _HOMES = {
+    "adversarial_learner": (
+        "AdversarialReport",
+        "AdversarialState",
+        "AdversarialTraining",
+        "FaceValue",
+        "adversarial",
+        "airl",
+        "gail",
+    ),
+    "adversarial_tabular": (
+        "airl_tabular",
+        "gail_tabular",
+        "gibbs_airl_tabular",
+        "robust_airl_tabular",
+        "robust_airl_with_learned_sensor",
+        "robust_gail_tabular",
+    ),
     "boltzmann": (
         "boltzmann_log_likelihoods",
         "boltzmann_log_policy",
@@ -15,11 +32,35 @@ _HOMES = {
     ),
     "clustering": ("Clustering",),
     "darko": ("darko_i2rl", "ending_at", "feature_margin", "goal_sessions", "stopping_places", "with_end"),
+    "discriminator": (
+        "Discriminator",
+        "ExpertTransitions",
+        "Transitions",
+        "airl_discriminator",
+        "gail_discriminator",
+    ),
     "dpm": ("DPMBIRL", "DPMTrace", "dpm_birl"),
     "entropic": ("entropic_proportions",),
+    "gaussian_gibbs": ("GaussianGibbs",),
+    "gaussian_truth": (
+        "GaussianTruth",
+        "fitted_sensor",
+        "jax_dynamics",
+    ),
+    "hidden_truth": (
+        "Smoothed",
+        "SmoothedAndFitted",
+        "robust_airl",
+        "robust_airl_with_sensor",
+    ),
     "identification": ("SensorIdentification", "sensor_identification", "sensor_identifier"),
     "jin": ("jin_i2rl", "jin_i2rl_with_features", "reward_correction", "with_state_features"),
     "journal": ("Journal", "JournalBusy", "JournalError", "JournalView", "Position", "SessionRecord"),
+    "kalman": (
+        "AffineGaussian",
+        "filter_gaussian",
+        "smooth_gaussian",
+    ),
     "lme": (
         "Batch",
         "BatchFit",
@@ -60,6 +101,12 @@ _HOMES = {
         "unidentified_predicates",
     ),
     "observation_printed": ("solve_printed_program",),
+    "partition_truth": (
+        "CandidateTruth",
+        "PartitionTruth",
+        "candidate_truth",
+        "fitted_shift_sensor",
+    ),
     "perception": ("WithTruth",),
     "policy_walk": ("birl",),
     "ppo": ("PPO", "PPOState"),
@@ -103,7 +150,16 @@ _HOMES = {
         "sample_completions",
         "smooth_all",
     ),
+    "snippet_regression": (
+        "Regression",
+        "SSRRReward",
+    ),
     "statistic": ("CountStatistic", "FeatureStatistic"),
+    "tabular_training": (
+        "TabularAdversarialReport",
+        "TabularAdversarialState",
+        "TabularTraining",
+    ),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME_OF)

@@ -8,6 +8,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from .confusions import Confusions
 from .demonstration import (
     Demonstration,
     DemonstrationError,
@@ -47,26 +48,33 @@ from .planning import (
     simulate,
     soft_plan,
 )
+from .sensing import GaussianSensor, Recording, RecordingError, ShiftSensor, distort, recording
 from .storage import load_mdp, save_mdp
 from .trajectory import TrajectoryLaw, sample_demonstration
 
 __all__ = [
+    "Confusions",
     "Demonstration",
     "DemonstrationError",
     "FeatureNoise",
     "FinitePlan",
+    "GaussianSensor",
     "HardPlan",
     "Imperfection",
     "MixtureLaw",
     "ObservationModel",
     "Record",
+    "Recording",
+    "RecordingError",
     "Sensor",
+    "ShiftSensor",
     "SoftPlan",
     "TabularMDP",
     "TrajectoryLaw",
     "Visibility",
     "concatenate",
     "deterministic_policy",
+    "distort",
     "feature_deviations",
     "feature_expectations",
     "features_to_go",
@@ -82,6 +90,7 @@ __all__ = [
     "policy_values",
     "reachable_states",
     "read_trajectories",
+    "recording",
     "require_possible",
     "reward_of",
     "sample_demonstration",
