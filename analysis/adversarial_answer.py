@@ -8,7 +8,8 @@ from pathlib import Path
 
 from . import adversarial_study
 from .adversarial_cases import PLANS, Plan
-from .adversarial_report import print_tables, summary, write
+from .adversarial_report import print_tables, summary
+from .adversarial_report import write as write_study
 from .adversarial_results import AdversarialResults
 
 __all__ = ["answer", "print_tables", "summary", "write"]
@@ -30,13 +31,23 @@ def answer(
     if domain == "patrol":
         from .adversarial_patrol import patrol_results
 
-        return patrol_results(seeds, sessions, noise, advance=advance)
+        results = patrol_results(seeds, sessions, noise, advance=advance)
+        return results._replace(machine=_machine())
     plan = _scaled(PLANS[domain], noise)
     if sessions is not None:
         plan = plan._replace(sessions=sessions)
     return adversarial_study.study(
         domain, seeds, plan, workers=workers, folder=kept, machine=_machine(), advance=advance
     )
+
+
+def write(results: AdversarialResults, folder: Path | str) -> Path:
+    """Write the report of one task; of patrol, what one learner believes of a trajectory besides."""
+    if results.domain != "patrol":
+        return write_study(results, folder)
+    from .adversarial_patrol import believed_trajectories
+
+    return write_study(results, folder, believed_trajectories(results))
 
 
 def _scaled(plan: Plan, noise: float) -> Plan:

@@ -14,8 +14,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
-from scipy import stats
 
+from .adversarial_patrol import interval
 from .figures import set_scale
 from .style import SMALL, TEXT, Theme, dress, foot, head, new_figure, save_themes, series_style
 
@@ -70,7 +70,7 @@ def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     levels = sorted({r["level"] for r in results["noise"].values() if "level" in r})
     for i, (name, memory) in enumerate(((NOISY, 0.0), (ROBUST, 0.0), (NOISY, 1.0), (ROBUST, 1.0))):
         found = [(x, _noise(results, name, x, memory)) for x in levels]
-        values = [(x, _interval(_last(one))) for x, one in found if one is not None]
+        values = [(x, interval(_last(one))) for x, one in found if one is not None]
         x, (mean, half) = np.array([x for x, _ in values]), np.array([v for _, v in values]).T
         style = series_style(theme, i)
         at = x + (i - 1.5) * 0.0025
@@ -109,7 +109,7 @@ def _breaches(axes: Axes, results: Results, theme: Theme, level: float) -> None:
         if name in PUBLISHED:
             low, high = PUBLISHED[name]
             axes.barh(y, high - low, left=low, height=0.55, color=theme.muted, alpha=0.45, linewidth=0)
-        mean, half = _interval(success)
+        mean, half = interval(success)
         axes.hlines(y, mean - half, min(mean + half, 1.0), color=theme.series[0], linewidth=2.2, alpha=0.65)
         axes.plot(mean, y, linestyle="", marker="o", markersize=7, color=theme.series[0])
     dress(
@@ -197,14 +197,8 @@ def _required(one: Mapping[str, Any] | None) -> Mapping[str, Any]:
     return one
 
 
-def _interval(runs: Float[np.ndarray, "R ..."]) -> tuple[np.ndarray, np.ndarray]:
-    n = len(runs)
-    half = stats.t.ppf(0.975, n - 1) * runs.std(0, ddof=1) / np.sqrt(n) if n > 1 else 0 * runs[0]
-    return runs.mean(0), half
-
-
 def _draw_mean(axes: Axes, theme: Theme, i: int, name: str, x: np.ndarray, runs: np.ndarray) -> None:
-    style, (mean, half) = series_style(theme, i), _interval(runs)
+    style, (mean, half) = series_style(theme, i), interval(runs)
     top = np.minimum(mean + half, 1.0)
     axes.fill_between(x, mean - half, top, color=style["color"], alpha=0.18, linewidth=0)
     every = max(len(x) // 7, 1)

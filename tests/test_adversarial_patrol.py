@@ -5,20 +5,19 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from i2rl.analysis.adversarial_patrol_figures import noise_curves, noise_levels, view_curves
-from i2rl.analysis.benchmarks.adversarial_patrol import CLEAN as CLEAN_INPUT
-from i2rl.analysis.benchmarks.adversarial_patrol import (
+from i2rl.analysis.adversarial_patrol import STEPS, interval, noisy_streams
+from i2rl.analysis.adversarial_patrol_figures import CLEAN as CLEAN_INPUT
+from i2rl.analysis.adversarial_patrol_figures import (
     GAIL,
-    LEVELS,
     LME,
     NOISY,
     ROBUST,
     ROBUST_GAIL,
-    STEPS,
-    VIEWS,
-    interval,
-    noisy_streams,
+    noise_curves,
+    noise_levels,
+    view_curves,
 )
+from i2rl.analysis.benchmarks.adversarial_patrol import LEVELS, VIEWS
 from i2rl.analysis.style import DARK, LIGHT
 from i2rl.domains.patrol import FORWARD, LEFT, RIGHT, instance
 from i2rl.models.demonstration import PAD

@@ -21,92 +21,40 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
-from scipy import stats
 
-from ...domains.breach_trials import breach_trials
-from ...domains.patrol import FORWARD, LEFT, RIGHT, Patrol, demonstrate, instance
+from ...domains.patrol import Patrol, demonstrate, instance
 from ...inference.adversarial_tabular import (
-    airl_tabular,
     gail_tabular,
     gibbs_airl_tabular,
     robust_airl_tabular,
-    robust_airl_with_learned_sensor,
     robust_gail_tabular,
 )
 from ...inference.lme import lme_i2rl
-from ...inference.session import Learner, run_streams
-from ...models.confusions import Confusions
-from ...models.demonstration import PAD, UNKNOWN, Demonstration
-from ...models.evidence import Sensor, observe
-from ...models.planning import deterministic_policy, hard_plan, reward_of, simulate
-from ..metrics import optimal_actions, policy_accuracy
+from ...inference.session import Learner
+from ...models.demonstration import Demonstration
+from .. import adversarial_results as methods
+from ..adversarial_patrol import (
+    Outcome,
+    Streams,
+    interval,
+    noise_learners,
+    noisy_streams,
+    outcome_of,
+    success_rates,
+)
+from ..adversarial_patrol_figures import CLEAN, GAIL, LAST, LEARNED, LME, NOISY, ROBUST, ROBUST_GAIL
 from .harness import DEFAULT_FOLDER, machine, print_table, seconds
 
-STEPS, LEAST, MOST = 8, 4, 16
 LEVELS = (0.05, 0.1, 0.2, 0.3)
-ASSUMED = 0.15
-CLEAN, NOISY, ROBUST, LEARNED, LME, GIBBS, LOGITS = (
-    "AIRL, clean input", "AIRL, noisy input", "robust-AIRL", "robust-AIRL, sensor learned", "LME-I2RL",
-    "robust-AIRL, Gibbs", "robust-AIRL, average of logits",
-)  # fmt: skip
-LAST = 15
+GIBBS, LOGITS = "robust-AIRL, Gibbs", "robust-AIRL, average of logits"
 # Of those tried, the best for GAIL in a full view.
 GAIL_OPTIONS: dict[str, Any] = {"occupancy": "discounted"}
-GAIL, ROBUST_GAIL = "online GAIL", "GAIL, hidden steps in expectation"
 VIEWS = (100, 70, 30)
 WINDOW = 5
-
-
-class Streams(NamedTuple):
-    """The same sessions as they happened and as they were reported, ``[R, T, n, L]``; ``pairs [T]`` seen."""
-
-    truth: Demonstration
-    seen: Demonstration
-    sensor: Sensor
-    confusions: Confusions
-    pairs: Int[np.ndarray, " T"]
-
-
-def confusions_of(patrol: Patrol, forward_as_left: float, right_as_forward: float) -> Confusions:
-    """The two confusions of section 7.4.3."""
-    kinds = [(FORWARD, LEFT), (RIGHT, FORWARD)]
-    chances = np.array([forward_as_left, right_as_forward])
-    return Confusions.of_actions(patrol.mdp.n_states, kinds, chances, patrol.mdp.n_actions)
-
-
-def noisy_streams(patrol: Patrol, level: float, runs: int, sessions: int, seed: int = 0) -> Streams:
-    """Reports of the patroller's greedy expert; the truth is the same at every level."""
-    confusions = confusions_of(patrol, level, level)
-    sensor = Sensor(None, confusions.reading)
-    log_policy = jnp.log(jnp.asarray(patrol.expert_policy()))
-
-    def one(key: Array) -> tuple[Array, Array, Array]:
-        act, look = jax.random.split(key)
-        states, actions = simulate(act, patrol.mdp, log_policy, STEPS)
-        return states, actions, observe(look, sensor, states, actions)
-
-    keys = jax.random.split(jax.random.key(seed), runs * sessions * MOST)
-    states, actions, codes = jax.jit(partial(jax.lax.map, one, batch_size=64))(keys)
-    # Sizes are those of all runs, so that curves share their axis.
-    sizes = np.random.default_rng(seed).integers(LEAST, MOST + 1, sessions)
-    there = np.broadcast_to((np.arange(MOST) < sizes[:, None])[..., None], (runs, sessions, MOST, STEPS))
-
-    def shaped(demonstration: Demonstration) -> Demonstration:
-        arrays = (np.asarray(x).reshape(there.shape) for x in demonstration)
-        fills = (PAD, UNKNOWN, UNKNOWN, np.nan)
-        return Demonstration(
-            *(np.where(there, x, f).astype(x.dtype) for x, f in zip(arrays, fills, strict=True))
-        )
-
-    truth = shaped(Demonstration.from_pairs(np.asarray(states), np.asarray(actions)))
-    seen = shaped(Demonstration.from_codes(np.asarray(codes)))
-    return Streams(truth, seen, sensor, confusions, np.cumsum(sizes) * STEPS)
 
 
 def view_streams(patrol: Patrol, view: int, runs: int, sessions: int, seed: int = 0) -> Demonstration:
@@ -116,73 +64,6 @@ def view_streams(patrol: Patrol, view: int, runs: int, sessions: int, seed: int 
     return Demonstration(
         *(np.stack([np.asarray(x)[:, None] for x in parts]) for parts in zip(*rows, strict=True))
     )
-
-
-class Outcome(NamedTuple):
-    """One learner on all streams.
-
-    Fields
-    ------
-    accuracy : float ``[R, T]``, LBA over all states of the learned policy's likeliest actions
-    policies : float ``[R, S, A]``, the final ones, deterministic
-    noise : float ``[R, M]``, learned probabilities of confusions
-    seconds : float, compilation included
-    """
-
-    accuracy: Float[np.ndarray, "R T"]
-    policies: Float[np.ndarray, "R S A"]
-    noise: Float[np.ndarray, "R M"]
-    seconds: float
-
-
-def outcome_of(patrol: Patrol, learner: Learner, streams: Demonstration, seed: int = 1) -> Outcome:
-    """Run a learner over all streams, one after another, judged after every session."""
-    mdp = patrol.mdp
-    optimal = optimal_actions(mdp, jnp.asarray(patrol.weights))
-
-    def policy_of(state: Any) -> Float[Array, "S A"]:
-        if hasattr(state, "log_policy"):
-            return jax.nn.one_hot(jnp.argmax(state.log_policy, axis=1), mdp.n_actions)
-        return deterministic_policy(hard_plan(mdp, reward_of(mdp, state.weights)).optimal)
-
-    def judged(state: Any, report: Any) -> tuple:
-        accuracy = policy_accuracy(mdp, optimal, policy_of(state)).overall
-        return accuracy, getattr(report, "noise", jnp.zeros(0))
-
-    results: list[Any] = []
-
-    def run() -> None:
-        results.append(jax.block_until_ready(run_streams(learner, jax.random.key(seed), streams, judged)))
-
-    took = seconds(run)
-    states, (accuracy, noise) = results[0]
-    policies = jax.lax.map(policy_of, states)
-    return Outcome(np.asarray(accuracy), np.asarray(policies), np.asarray(noise)[:, -1], took)
-
-
-def interval(values: Float[np.ndarray, "R ..."]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over runs, and half the width of its 95 % interval (Student)."""
-    n = len(values)
-    half = stats.t.ppf(0.975, n - 1) * values.std(0, ddof=1) / np.sqrt(n) if n > 1 else 0 * values[0]
-    return values.mean(0), half
-
-
-def success_rates(
-    patrol: Patrol, policies: Float[np.ndarray, "R S A"], trials: int, seed: int = 2
-) -> Float[np.ndarray, " R"]:
-    """Share of breaches that reach the goal unseen, with each run's policy for both patrollers.
-
-    Everything is in view and read rightly while the learner waits: what differs is the policy alone.
-    """
-    rates = []
-    for i, policy in enumerate(policies):
-        both = jnp.broadcast_to(jnp.log(jnp.asarray(policy)), (patrol.patrollers, *policy.shape))
-        outcome = breach_trials(
-            jax.random.fold_in(jax.random.key(seed), i), patrol, both, observability=100,
-            observed_steps=STEPS, trials=trials,
-        )  # fmt: skip
-        rates.append(outcome.rate())
-    return np.array(rates)
 
 
 # -- studies ------------------------------------------------------------------------------------------
@@ -204,17 +85,24 @@ class _File:
             print(part, name, {k: v for k, v in known[name].items() if np.ndim(v) == 0}, flush=True)
 
 
+def _timed(patrol: Patrol, learner: Learner, streams: Demonstration) -> tuple[Outcome, float]:
+    """All streams of a learner, and the seconds they took, compilation included."""
+    found: list[Outcome] = []
+    took = seconds(lambda: found.append(outcome_of(patrol, learner, streams)))
+    return found[0], took
+
+
 def noise_methods(
     streams: Streams, patrol: Patrol
 ) -> dict[str, tuple[Callable[..., Learner], Demonstration]]:
     """Learners (given options) and what each sees."""
     mdp = patrol.mdp
-    assumed = confusions_of(patrol, ASSUMED, ASSUMED)
+    shared = noise_learners(patrol, streams.sensor)
     return {
-        CLEAN: (partial(airl_tabular, mdp), streams.truth),
-        NOISY: (partial(airl_tabular, mdp), streams.seen),
-        ROBUST: (partial(robust_airl_tabular, mdp, streams.sensor), streams.seen),
-        LEARNED: (partial(robust_airl_with_learned_sensor, mdp, assumed), streams.seen),
+        CLEAN: (shared[methods.CLEAN], streams.truth),
+        NOISY: (shared[methods.NOISY], streams.seen),
+        ROBUST: (shared[methods.ROBUST], streams.seen),
+        LEARNED: (shared[methods.LEARNED], streams.seen),
         GIBBS: (partial(gibbs_airl_tabular, mdp, streams.sensor, draws=10, burn_in=10), streams.seen),
         LOGITS: (partial(robust_airl_tabular, mdp, streams.sensor, average="logits"), streams.seen),
         LME: (lambda **_: lme_i2rl(mdp, streams.sensor), streams.seen),
@@ -268,10 +156,10 @@ def noise_study(
             tried: int = tried,
             pairs: np.ndarray = streams.pairs,
         ) -> dict[str, Any]:
-            found = outcome_of(patrol, learner, own)
+            found, took = _timed(patrol, learner, own)
             success = success_rates(patrol, found.policies, tried) if tried else np.zeros(0)
             return {
-                "name": name, "level": level, "memory": memory, "seconds": found.seconds,
+                "name": name, "level": level, "memory": memory, "seconds": took,
                 "final": float(found.accuracy[:, -LAST:].mean()), "trials": tried,
                 "success mean": float(success.mean()) if tried else None,
                 "pairs": pairs.tolist(), "accuracy": found.accuracy.round(5).tolist(),
@@ -304,9 +192,9 @@ def view_study(file: _File, *, runs: int, sessions: int, rounds: int) -> None:
                 learner: Learner = learner,
                 seen: Demonstration = seen,
             ) -> dict[str, Any]:
-                found = outcome_of(patrol, learner, seen)
+                found, took = _timed(patrol, learner, seen)
                 return {
-                    "name": name, "view": view, "memory": memory, "seconds": found.seconds,
+                    "name": name, "view": view, "memory": memory, "seconds": took,
                     "final": float(found.accuracy[:, -1].mean()),
                     "accuracy": found.accuracy.round(5).tolist(),
                 }  # fmt: skip
