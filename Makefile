@@ -41,10 +41,13 @@ bench: $(READY)
 	$(BIN)/python -m i2rl.analysis.benchmarks.selection
 	$(BIN)/python -m i2rl.analysis.benchmarks.kills
 	$(BIN)/python -m i2rl.analysis.benchmarks.noisy_cost
+	$(BIN)/python -m i2rl.analysis.benchmarks.adversarial_cost
+	$(BIN)/python -m i2rl.analysis.benchmarks.adversarial_patrol
 
 bench-peers: $(READY) $(PEERS)/.installed
 	$(BIN)/python -m i2rl.analysis.benchmarks.peers --peer-python $(PEERS)/bin/python
 	$(BIN)/python -m i2rl.analysis.benchmarks.ppo_peer --peer-python $(PEERS)/bin/python
+	$(BIN)/python -m i2rl.analysis.benchmarks.airl_peers --peer-python $(PEERS)/bin/python
 
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "i2rl needs Python 3.11 or later: make PYTHON=python3.11 ...")'

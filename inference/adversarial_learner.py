@@ -195,7 +195,7 @@ class AdversarialTraining(NamedTuple):
     average: str = "log_probabilities"
     penalty: float = 1.0
     replay: int = 1
-    refresh: int = 1
+    refresh: int = 10
 
     def checked(self) -> AdversarialTraining:
         """Itself. Raises ``ValueError`` naming a field that cannot be."""
