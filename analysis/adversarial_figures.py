@@ -68,6 +68,7 @@ def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
         panel.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         panel.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
         if measure == "accuracy":
+            panel.yaxis.set_major_locator(MaxNLocator(8, steps=[1, 2, 5, 10]))
             panel.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
             panel.set_ylim(top=1.01)
         else:

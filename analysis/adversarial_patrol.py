@@ -266,11 +266,11 @@ def patrol_results(
             "rounds": rounds,
             "memory of earlier sessions": 0.0,
             "trials of a breach, a policy": trials,
-            "breaches that succeed with the true policy": success_rates(patrol, true, trials).tolist(),
             "probability of a misreport, before it is learned": ASSUMED,
             "learned probabilities of misreports, a row a seed": noises,
             POLICY: first.round(6).tolist(),
         },
+        expert_breaches=float(success_rates(patrol, true, trials).mean()),
     )
 
 

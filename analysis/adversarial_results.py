@@ -150,6 +150,8 @@ class AdversarialResults(NamedTuple):
     frames : FrameStrip a row
     cells : mapping from a method's name to LBA in each cell ``[cells, cells]`` of mountain car, mean of seeds
     settings : mapping from words to plain values, for the file
+    expert_breaches : float or None
+        Share of breaches of the patrol that succeed with the expert's own policy.
     """
 
     domain: str
@@ -164,6 +166,7 @@ class AdversarialResults(NamedTuple):
     frames: tuple[FrameStrip, ...] = ()
     cells: Mapping[str, Float[np.ndarray, "cells cells"]] = {}
     settings: Mapping[str, Any] = {}
+    expert_breaches: float | None = None
 
     @property
     def title(self) -> str:
