@@ -17,7 +17,7 @@ def main() -> None:
     import gymnasium
     import numpy as np
     import torch
-    from imitation.algorithms.adversarial.adversarial_learner import AIRL
+    from imitation.algorithms.adversarial.airl import AIRL
     from imitation.data.types import Trajectory
     from imitation.data.wrappers import RolloutInfoWrapper
     from imitation.rewards.reward_nets import BasicShapedRewardNet
