@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from ..models.extras import required
 from ..models.networks import DTYPE, ActionSpace, Policy, ShapedReward
-from ..models.sensing import Recording
+from ..models.sensing import Recording, require_recording
 from .discriminator import (
     AVERAGES,
     Discriminator,
@@ -60,6 +60,10 @@ class Task(NamedTuple):
     def n_actions(self) -> int:
         """How many actions there are; of vectors, how long they are."""
         return self.actions.size
+
+    def require(self, recording: Recording) -> None:
+        """Raise :class:`~i2rl.models.sensing.RecordingError` for a recording of another task, or of none."""
+        require_recording(recording, self.observation_size, self.actions.n, len(self.actions.low))
 
     def fingerprint(self) -> str:
         """Digest of all fields."""
@@ -202,6 +206,10 @@ class AdversarialTraining(NamedTuple):
         for name in ("rounds", "updates", "batch", "replay", "refresh"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate must be positive, got {self.learning_rate}")
+        if not self.penalty >= 0:
+            raise ValueError(f"penalty must not be negative, got {self.penalty}")
         if self.average not in AVERAGES:
             raise ValueError(f"average is one of {', '.join(AVERAGES)}, got {self.average!r}")
         return self
@@ -219,7 +227,12 @@ def adversarial(
 
     ``generator`` is a :class:`PPO`, or has as it does an ``environment``, ``settings``, ``init(key)``,
     ``collect(state)`` and ``improve(state, rollout, rewards)``, and states with a ``policy``. ``truth`` is
-    :class:`FaceValue` by default. Recordings of one shape are compiled for once.
+    :class:`FaceValue` by default. Recordings of one shape are compiled for once. ``configuration`` adds to
+    what identifies the learner to a journal.
+
+    Its ``update`` raises :class:`~i2rl.models.sensing.RecordingError` (a ``ValueError``) for a recording of
+    another task or with numbers that are not finite, naming trajectory and step; the state it was given
+    stays valid.
     """
     environment = generator.environment
     task = Task(environment.name, environment.observation_size, environment.actions)
@@ -247,6 +260,7 @@ def adversarial(
 
     def update(state: AdversarialState, recording: Recording) -> tuple[AdversarialState, AdversarialReport]:
         began = time.perf_counter()
+        task.require(recording)
         key, k_chain = jax.random.split(state.key)
         network, memory, acting = state.network, state.optimiser, state.generator
         replay, sensor, rounds = state.replay, state.sensor, int(state.rounds)
@@ -300,6 +314,8 @@ def adversarial(
 
     settings = {
         "discriminator": discriminator.name,
+        "networks": dict(discriminator.settings),
+        "horizon": environment.horizon,
         "agent": generator.settings._asdict(),
         **how._asdict(),
         **dict(configuration or {}),

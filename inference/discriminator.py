@@ -6,8 +6,8 @@ reports, so ``log D`` is averaged over samples of the truth given the reports.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -59,6 +59,7 @@ class Discriminator(NamedTuple):
     offset : function ``(policy, transitions)``, the policy's part of the log-odds
     rewards : function ``(network, policy, transitions)`` giving what the generator earns, ``[...]``; what it
         earns for ever after termination is part of the last step's
+    settings : mapping of all that tells it from others of its name, for a journal
     """
 
     name: str
@@ -66,6 +67,7 @@ class Discriminator(NamedTuple):
     score: Callable[[ShapedReward, Array, Array, Array, Array], Array]
     offset: Callable[[Policy, Transitions], Array]
     rewards: Callable[[ShapedReward, Policy, Transitions], Array]
+    settings: Mapping[str, Any] = {}
 
     def logits(self, network: ShapedReward, policy: Policy, steps: Transitions) -> Float[Array, "..."]:
         """Log-odds of "expert", in nats."""
@@ -90,8 +92,10 @@ def airl_discriminator(
     """``D = exp f / (exp f + pi)`` with ``f = g + gamma h(s') - h(s)`` (Fu, Luo and Levine 2018).
 
     The generator earns ``f - entropy * log pi``: with 1, ``log D - log(1 - D)``, of which its optimum is the
-    soft-optimal policy; with 0, ``f`` alone, as in the released code.
+    soft-optimal policy; with 0, ``f`` alone, as in the released code. Raises ``ValueError`` for a discount
+    that is not below 1, with which what follows termination has no value.
     """
+    _require_discount(discount)
 
     def init(key: Array) -> ShapedReward:
         return ShapedReward.create(
@@ -114,6 +118,13 @@ def airl_discriminator(
         lambda network, *inputs: network.shaped_at(*inputs),
         lambda policy, steps: -policy.log_prob(steps.observations, steps.actions),
         rewards,
+        {
+            "discount": discount,
+            "entropy": entropy,
+            "reward": list(reward),
+            "potential": list(potential),
+            "state_only": state_only,
+        },
     )
 
 
@@ -128,8 +139,9 @@ def gail_discriminator(
 
     The generator earns ``log D - log(1 - D)``. Of ``log D`` every step costs something, and of
     ``-log(1 - D)`` every step pays, so that they teach to end episodes, or to prolong them, whatever the
-    expert does (Kostrikov et al. 2019).
+    expert does (Kostrikov et al. 2019). Raises as :func:`airl_discriminator`.
     """
+    _require_discount(discount)
 
     def init(key: Array) -> ShapedReward:
         return ShapedReward.create(
@@ -146,7 +158,15 @@ def gail_discriminator(
         lambda network, z, a, following, terminated: network.reward_at(z, a),
         lambda policy, steps: jnp.zeros((), jnp.float32),
         rewards,
+        {"discount": discount, "hidden": list(hidden)},
     )
+
+
+def _require_discount(discount: float) -> None:
+    if not 0 <= discount < 1:
+        raise ValueError(
+            f"the discount must be in [0, 1), or what follows termination has no value; got {discount}"
+        )
 
 
 def _for_ever(reward: Array, discount: float) -> Array:

@@ -189,7 +189,7 @@ def _log_acceptance(
 
 
 class GaussianGibbs(NamedTuple):
-    """``init(recording, key) -> chain`` and ``refresh(chain, policy, key, sensor) -> (chain, truths)``.
+    """``init(recording) -> chain`` and ``refresh(chain, policy, key, sensor) -> (chain, truths)``.
 
     Fields
     ------

@@ -319,6 +319,10 @@ class GaussianTruth(NamedTuple):
                 f"{reported.observations.shape} and {reported.actions.shape}"
             )
         k = reported.actions.shape[-1]
+        if self.bounds.low.ndim and len(self.bounds.low) != d + k:
+            raise ValueError(
+                f"there are bounds of {len(self.bounds.low) - d} actions, but actions [n, L, {k}]"
+            )
         sensor = sensor.sized(d, k)
         means = jnp.concatenate([reported.observations, reported.actions], -1)
         n, length, D = means.shape
@@ -445,7 +449,7 @@ def gaussian_truth(
             raise ValueError(f"lower bounds must be below upper ones, got {low} and {high}")
 
     def matrix(whose: str, given: ArrayLike) -> Array:
-        return covariance_matrix(whose, checked_covariance(whose, given), d)
+        return covariance_matrix(whose, checked_covariance(whose, np.asarray(given, float)), d)
 
     return GaussianTruth(
         dynamics,

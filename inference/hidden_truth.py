@@ -13,6 +13,7 @@ chain goes on from where the last look left it.
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -151,6 +152,12 @@ def robust_airl(
         With the dynamics: ``gaussian_truth(robot, robot.observation_size)``, say.
     sensor : the sensor behind the reports, such as :class:`GaussianSensor`
     discriminator, training : by default AIRL's, and :class:`AdversarialTraining`'s own
+
+    Raises
+    ------
+    ValueError
+        For a sensor that cannot be: a covariance of another size or not positive definite, a probability
+        outside [0, 1].
     """
     return _learner("robust-AIRL", generator, Smoothed(truth, sensor), discriminator, training)
 
@@ -178,6 +185,35 @@ def _learner(
 ) -> Learner:
     environment = generator.environment
     if discriminator is None:
-        discriminator = airl_discriminator(environment.observation_size, environment.actions)
-    known = {"truth": type(hidden.truth).__name__, "sensor": jax.tree.map(np.asarray, hidden.sensor)}
+        discriminator = airl_discriminator(
+            environment.observation_size, environment.actions, generator.settings.gamma
+        )
+    hidden = hidden._replace(sensor=_carried(hidden.sensor, environment))
+    known = {
+        "truth": type(hidden.truth).__name__,
+        "truth settings": _digest(hidden.truth),
+        "sensor": [np.asarray(x).tolist() for x in jax.tree.leaves(hidden.sensor)],
+        "passes": hidden.passes,
+    }
+    if isinstance(hidden, SmoothedAndFitted):
+        known |= {"fit": getattr(hidden.fit, "__name__", type(hidden.fit).__name__), "steps": hidden.steps}
     return adversarial(name, generator, discriminator, hidden, training, known)
+
+
+def _carried(sensor: Any, environment: Any) -> Any:
+    """A sensor checked, as arrays of the shapes that a fitted one has too."""
+    if isinstance(sensor, GaussianSensor):
+        checked = GaussianSensor(*(np.asarray(x, float) for x in sensor))
+        return checked.sized(environment.observation_size, environment.actions.size)
+    if isinstance(sensor, ShiftSensor) and not 0 <= float(sensor.probability) <= 1:
+        raise ValueError(f"the probability of a shift must be in [0, 1], got {sensor.probability}")
+    return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, sensor)
+
+
+def _digest(truth: Any) -> str:
+    """Identifies what is assumed of the truth, but for the dynamics, which are functions."""
+    digest = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(truth):
+        if not any(getattr(part, "name", None) == "dynamics" for part in path):
+            digest.update(jax.tree_util.keystr(path).encode() + np.asarray(leaf).tobytes())
+    return digest.hexdigest()[:16]

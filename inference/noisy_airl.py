@@ -325,6 +325,7 @@ def noisy_airl(
 
     def update(state: AdversarialState, recording: Recording) -> tuple[AdversarialState, AdversarialReport]:
         began = time.perf_counter()
+        task.require(recording)
         expert = reported_steps(recording)
         key, network, memory = state.key, state.network, state.optimiser
         acting, replay, rounds = state.generator, state.replay, int(state.rounds)
@@ -368,7 +369,13 @@ def noisy_airl(
         )
         return state, report
 
-    known = {"discriminator": discriminator.name, "agent": settings._asdict(), **how._asdict()}
+    known = {
+        "discriminator": discriminator.name,
+        "networks": dict(discriminator.settings),
+        "horizon": environment.horizon,
+        "agent": settings._asdict(),
+        **how._asdict(),
+    }
     return Learner("noisy-AIRL", task, {**known, **dict(configuration or {})}, init, update)  # type: ignore[arg-type]
 
 

@@ -326,10 +326,7 @@ class PartitionTruth(NamedTuple):
 
     def cells(self, chain: Recording, policy: Any, sensor: FiniteSensor) -> Float[Array, "n L S"]:
         """Posterior probability of each cell."""
-        factors = self.factors(chain, policy, sensor)
-        return jax.vmap(lambda e, live: smooth(self.partition.mdp, e, live).pairs.sum(-1))(
-            factors, chain.live
-        )
+        return _cell_posterior(self.partition, policy, sensor, chain)
 
     def refresh(
         self, chain: Recording, policy: Any, key: Array, sensor: FiniteSensor

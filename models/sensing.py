@@ -153,6 +153,55 @@ def _check_trajectory(
             raise RecordingError(f"trajectory {i}, step {t}: there is no action {actions[t]}{known}")
 
 
+def require_recording(reported: Recording, observation_size: int, n_actions: int, action_size: int) -> None:
+    """Raise :class:`RecordingError` for a recording that a learner of a task cannot take.
+
+    ``n_actions`` is their number, or 0 where they are vectors of ``action_size``. Looked at are the shapes,
+    numbers that are not finite (trajectory and step are named, padding included, as it passes through the
+    dynamics), actions that do not exist, padding between steps, and whether there is a step at all whose
+    successor or termination is known. Vectors beyond their bounds are fine: reports of noise are.
+    """
+    if not isinstance(reported, Recording):
+        raise RecordingError(f"this learner learns from a Recording, got a {type(reported).__name__}")
+    observations, actions, live, ended = (np.asarray(x) for x in reported)
+    rows = live.shape
+    wanted = rows if n_actions else (*rows, action_size)
+    if live.ndim != 2 or observations.shape != (*rows, observation_size) or actions.shape != wanted:
+        raise RecordingError(
+            f"this task has observations [n, L, {observation_size}] and actions "
+            f"{'[n, L] of whole numbers' if n_actions else f'[n, L, {action_size}]'}, got "
+            f"{observations.shape} and {actions.shape} with live {rows}"
+        )
+    if live.dtype != bool or ended.dtype != bool or ended.shape != rows[:1]:
+        raise RecordingError(
+            f"live [n, L] and terminated [n] must be booleans, got {live.dtype} {rows} and {ended.dtype} "
+            f"{ended.shape}"
+        )
+    for name, array in (("observation", observations), ("action", actions)):
+        wrong = np.argwhere(~np.isfinite(array).reshape(*rows, -1).all(-1))
+        if len(wrong):
+            i, t = wrong[0]
+            raise RecordingError(f"trajectory {i}, step {t}: the {name} is {array[i, t]}, not finite")
+    if n_actions:
+        if actions.dtype.kind not in "iu":
+            raise RecordingError(f"numbers of actions must be integers, got {actions.dtype}")
+        wrong = np.argwhere(live & ((actions < 0) | (actions >= n_actions)))
+        if len(wrong):
+            i, t = wrong[0]
+            raise RecordingError(
+                f"trajectory {i}, step {t}: there is no action {actions[i, t]}; there are actions 0 to "
+                f"{n_actions - 1}"
+            )
+    wrong = np.argwhere(live[:, 1:] & ~live[:, :-1])
+    if len(wrong):
+        i, t = wrong[0]
+        raise RecordingError(f"trajectory {i}: step {t} is padding, but step {t + 1} is not; padding is last")
+    if not (live[:, 1:].any() or (live.any(1) & ended).any()):
+        raise RecordingError(
+            "nothing can be learned from this recording: no step has a successor or ended its task"
+        )
+
+
 class ContinuousSensor(Protocol):
     """What reports of continuous states and actions are like, given the truth."""
 
@@ -193,7 +242,8 @@ class GaussianSensor(_GaussianFields):
     Raises
     ------
     ValueError
-        For a covariance that is not finite, not symmetric or not positive definite.
+        For a covariance that is not finite, not symmetric or not positive definite. JAX's own arrays, of
+        which a compiled function makes sensors too, are only looked at where a learner is made.
     """
 
     __slots__ = ()

@@ -5,10 +5,11 @@ import pytest
 from i2rl.domains.control import cart_pole
 from i2rl.inference.adversarial_learner import AdversarialTraining, adversarial, reported_steps
 from i2rl.inference.discriminator import airl_discriminator, gail_discriminator
-from i2rl.inference.journal import Journal
+from i2rl.inference.journal import Journal, JournalError
+from i2rl.inference.noisy_airl import NoisyTraining, noisy_airl
 from i2rl.inference.ppo import ppo
 from i2rl.inference.session import run_sessions
-from i2rl.models.sensing import Recording, recording
+from i2rl.models.sensing import Recording, RecordingError, recording
 
 SMALL = AdversarialTraining(rounds=3, updates=2, batch=32)
 
@@ -99,11 +100,70 @@ def test_reports_are_plain_numbers_of_what_happened(learner, demonstration):
 
 @pytest.mark.parametrize(
     ("wrong", "named"),
-    [({"rounds": 0}, "rounds"), ({"batch": 0}, "batch"), ({"average": "median"}, "average")],
+    [
+        ({"rounds": 0}, "rounds"),
+        ({"batch": 0}, "batch"),
+        ({"average": "median"}, "average"),
+        ({"learning_rate": float("nan")}, "learning_rate"),
+        ({"penalty": -1.0}, "penalty"),
+    ],
 )
 def test_training_that_cannot_be_is_refused_by_name(generator, task, wrong, named):
     with pytest.raises(ValueError, match=named):
         adversarial("AIRL", generator, airl_discriminator(4, task.actions), training=SMALL._replace(**wrong))
+
+
+def spoiled(x, at, value):
+    x = np.array(x)
+    x[at] = value
+    return x
+
+
+@pytest.mark.parametrize(
+    ("field", "change", "named"),
+    [
+        ("observations", lambda x: spoiled(x, (1, 3, 0), np.nan), "trajectory 1, step 3: the observation"),
+        ("observations", lambda x: x[..., :3], r"observations \[n, L, 4\].*got \(2, 40, 3\)"),
+        ("actions", lambda x: spoiled(x, (0, 2), 7), "trajectory 0, step 2: there is no action 7.*0 to 1"),
+        ("actions", lambda x: spoiled(x, (1, 5), -1), "trajectory 1, step 5: there is no action -1"),
+        ("actions", lambda x: np.asarray(x, float), "integers, got float64"),
+        ("actions", lambda x: np.zeros((2, 40, 1)), r"got \(2, 40, 4\) and \(2, 40, 1\)"),
+        ("live", lambda x: spoiled(x, (0, 3), False), "trajectory 0: step 3 is padding, but step 4 is not"),
+        ("live", np.zeros_like, "nothing can be learned"),
+    ],
+)
+@pytest.mark.parametrize("method", ["AIRL", "noisy-AIRL"])
+def test_recordings_that_cannot_be_are_refused_and_nothing_is_lost(
+    learner, generator, task, demonstration, method, field, change, named
+):
+    if method == "noisy-AIRL":
+        learner = noisy_airl(generator, airl_discriminator(4, task.actions), NoisyTraining(levels=(0.0, 0.1)))
+    state = learner.init(jax.random.key(0))
+    before = jax.tree.map(np.array, state.network)
+    with pytest.raises(RecordingError, match=named):
+        learner.update(state, demonstration._replace(**{field: change(getattr(demonstration, field))}))
+    assert same(before, state.network)
+
+
+def test_what_is_no_recording_is_refused(learner, demonstration):
+    with pytest.raises(RecordingError, match="learns from a Recording, got a tuple"):
+        learner.update(learner.init(jax.random.key(0)), tuple(demonstration))
+
+
+@pytest.mark.parametrize("setting", [{"discount": 0.9}, {"entropy": 0.0}, {"reward": (8,)}])
+def test_a_journal_refuses_another_discriminator(learner, generator, task, tmp_path, setting):
+    Journal.open(tmp_path / "run.journal", learner).close()
+    other = adversarial("AIRL", generator, airl_discriminator(4, task.actions, **setting), training=SMALL)
+    with pytest.raises(JournalError, match="networks"):
+        Journal.open(tmp_path / "run.journal", other)
+    with Journal.open(tmp_path / "run.journal", learner) as journal:
+        assert journal.session == 0
+
+
+@pytest.mark.parametrize("kind", [airl_discriminator, gail_discriminator])
+def test_a_discount_of_one_is_refused(task, kind):
+    with pytest.raises(ValueError, match=r"discount must be in \[0, 1\)"):
+        kind(4, task.actions, 1.0)
 
 
 @pytest.mark.parametrize("kind", [airl_discriminator, gail_discriminator])

@@ -6,12 +6,12 @@ import pytest
 from i2rl.inference.adversarial_learner import AdversarialTraining
 from i2rl.inference.gaussian_truth import gaussian_truth, jax_dynamics
 from i2rl.inference.hidden_truth import Smoothed, as_expert, robust_airl, robust_airl_with_sensor
-from i2rl.inference.journal import Journal
+from i2rl.inference.journal import Journal, JournalError
 from i2rl.inference.ppo import ppo
 from i2rl.inference.session import run_sessions
 from i2rl.models.environment import Environment
 from i2rl.models.networks import ActionSpace, policy_network
-from i2rl.models.sensing import GaussianSensor, Recording, distort, truths
+from i2rl.models.sensing import GaussianSensor, Recording, ShiftSensor, distort, truths
 
 COVARIANCE = 0.04
 
@@ -166,3 +166,63 @@ def test_reports_of_another_size_are_refused_and_nothing_is_lost(generator, trut
         learner.update(state, wrong)
     after, _ = learner.update(state, reports)
     assert int(after.session) == 2
+
+
+def test_a_sensor_given_in_short_has_the_shapes_of_a_fitted_one(generator, truth):
+    # Or its journal could not be resumed.
+    learner = robust_airl_with_sensor(generator, truth, GaussianSensor(0.02, [0.03]), training=TRAINING)
+    first = learner.init(jax.random.key(0)).sensor
+    np.testing.assert_array_equal(first.state_covariance, 0.02 * np.eye(2))
+    np.testing.assert_array_equal(first.action_covariance, [[0.03]])
+    shift = robust_airl_with_sensor(generator, truth, ShiftSensor(0.1, 0.25), training=TRAINING)
+    assert all(x.dtype == jnp.float64 for x in jax.tree.leaves(shift.init(jax.random.key(0)).sensor))
+
+
+@pytest.mark.parametrize("covariance", [-1.0, [[1.0, 2.0], [2.0, 1.0]]])
+def test_no_learner_is_made_with_a_covariance_that_is_none(generator, truth, covariance):
+    with pytest.raises(ValueError, match="state covariance is not positive definite"):
+        robust_airl(generator, truth, GaussianSensor(jnp.asarray(covariance), 0.1))
+    with pytest.raises(ValueError, match="process covariance is not positive definite"):
+        gaussian_truth(jax_dynamics(moved), 2, process_covariance=jnp.asarray(covariance))
+
+
+def test_no_learner_is_made_with_a_share_above_one(generator, truth):
+    with pytest.raises(ValueError, match=r"in \[0, 1\], got 1.5"):
+        robust_airl(generator, truth, ShiftSensor(0.1, 1.5))
+
+
+def test_bounds_of_other_actions_are_refused(generator, sensor, reports):
+    bounds = {"observation_bounds": (-9.0, 9.0), "action_bounds": ([-1.0, -1.0], [1.0, 1.0])}
+    learner = robust_airl(generator, gaussian_truth(jax_dynamics(moved), 2, **bounds), sensor)
+    with pytest.raises(ValueError, match="bounds of 2 actions"):
+        learner.update(learner.init(jax.random.key(0)), reports)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"process_covariance": 1e-3},
+        {"draws": 4},
+        {"observation_bounds": (-9, 9), "action_bounds": ([-1], [1])},
+    ],
+)
+def test_a_journal_refuses_another_truth(generator, truth, sensor, tmp_path, change):
+    Journal.open(tmp_path / "run.journal", robust_airl(generator, truth, sensor)).close()
+    other = gaussian_truth(jax_dynamics(moved), 2, **{"draws": 3, **change})
+    with pytest.raises(JournalError, match="truth settings"):
+        Journal.open(tmp_path / "run.journal", robust_airl(generator, other, sensor))
+    # The same made again is the same: nothing of it is known by where it lies in memory.
+    again = robust_airl(generator, gaussian_truth(jax_dynamics(moved), 2, draws=3), sensor)
+    Journal.open(tmp_path / "run.journal", again).close()
+
+
+def test_a_journal_refuses_another_sensor(generator, truth, sensor, tmp_path):
+    Journal.open(tmp_path / "run.journal", robust_airl(generator, truth, sensor)).close()
+    nearly = sensor._replace(state_covariance=sensor.state_covariance * (1 + 1e-9))
+    with pytest.raises(JournalError, match="sensor"):
+        Journal.open(tmp_path / "run.journal", robust_airl(generator, truth, nearly))
+
+
+def test_the_default_discriminator_has_the_generators_discount(task, truth, sensor):
+    agent = ppo(task, n_envs=4, n_steps=32, gamma=0.9)
+    assert robust_airl(agent, truth, sensor).configuration["networks"]["discount"] == 0.9
