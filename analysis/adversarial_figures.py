@@ -85,7 +85,8 @@ def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
     handles = max((p.get_legend_handles_labels()[0] for p in panels), key=len)
     head(figure, theme, handles, title=results.title, columns=2)
     over = f"; LBA over {results.accuracy_over}" if "accuracy" in shown else ""
-    foot(figure, theme, f"line: mean of {results.seeds} seeds; band: its 95% interval (Student's){over}")
+    seeds = f"{results.seeds} seed{'s' * (results.seeds != 1)}"
+    foot(figure, theme, f"line: mean of {seeds}; band: its 95% interval (Student's){over}")
     return figure
 
 
@@ -195,13 +196,19 @@ def scatter_plot(scatters: Mapping[str, RewardScatter], theme: Theme, title: str
                    markeredgecolor=theme.ink, label="the worst policy of the mix")
         )  # fmt: skip
     head(figure, theme, handles, title=title, columns=3 if columns > 2 else 2)
-    foot(figure, theme, "held-out episodes; r: Pearson's, with a 95% interval (trajectories drawn anew)")
+    over = next(iter(scatters.values())).correlation
+    foot(
+        figure,
+        theme,
+        f"{over.steps.n:,} steps of {over.trajectories.n:,} held-out trajectories; r: Pearson's, with a 95% "
+        "interval (trajectories drawn anew)",
+    )
     return figure
 
 
 def _told(found: Correlation) -> str:
     ends = found.bootstrap
-    return f"r = {found.pearson:.2f} ({ends.low:.2f} to {ends.high:.2f}), n = {found.n:,}"
+    return f"r = {found.pearson:.2f} ({ends.low:.2f} to {ends.high:.2f})"
 
 
 def belief_plot(belief: Belief, theme: Theme, title: str = "What happened, and what is believed") -> Figure:

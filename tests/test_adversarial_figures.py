@@ -162,7 +162,7 @@ def test_scatter_shows_the_trajectories_and_tells_the_correlation(hopper):
     told = shown[0].get_title(loc="left")
     assert told.startswith(CLEAN)
     assert f"r = {scatter.correlation.steps.pearson:.2f}" in told
-    assert "n = 240" in told
+    assert any(text.get_text().startswith("240 steps of") for text in figure.texts)
     assert scatter.correlation.steps.n == 240
 
 

@@ -27,6 +27,7 @@ def main() -> None:
     from stable_baselines3.common.evaluation import evaluate_policy
     from stable_baselines3.common.vec_env import DummyVecEnv
 
+    torch.set_num_threads(1)  # quicker than two for networks this small
     print(json.dumps({"imitation": version("imitation"), "torch": version("torch")}), flush=True)
     for request in sys.stdin:
         ask = json.loads(request)
