@@ -378,9 +378,9 @@ def recovered_share(
     """What of the return (or LBA) lost to noise a robust learner recovers, with a bootstrap over seeds.
 
     Entry ``i`` of all three is of the same seed, and seeds are drawn together. Where noise may have cost
-    nothing, the ratio has a pole: resamples without a loss count as minus or plus infinity by what the robust
-    learner gained. Of a few seeds a bootstrap's interval is too narrow. Raises ``ValueError`` for different
-    numbers of seeds, or none.
+    nothing, the ratio has a pole: means without a loss, of the seeds or of a resample, count as minus or plus
+    infinity by what the robust learner gained. Of a few seeds a bootstrap's interval is too narrow. Raises
+    ``ValueError`` for different numbers of seeds, none, or numbers that are not finite.
     """
     runs = [np.asarray(x, float) for x in (clean, noisy, robust)]
     n = len(runs[0])
@@ -388,11 +388,18 @@ def recovered_share(
         raise ValueError(
             f"clean, noisy and robust need one number a seed, got shapes {[x.shape for x in runs]}"
         )
+    for name, values in zip(("clean", "noisy", "robust"), runs, strict=True):
+        if not np.isfinite(values).all():
+            raise ValueError(f"seed {int(np.argmin(np.isfinite(values)))} of {name} is not finite")
+
+    def ratio(lost: np.ndarray, gained: np.ndarray) -> np.ndarray:
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(lost > 0, gained / lost, np.copysign(np.inf, gained))
+
+    cost, won = runs[0] - runs[1], runs[2] - runs[1]
     weights = np.asarray(_resampled(key, n, resamples), float) / n
-    lost, gained = weights @ (runs[0] - runs[1]), weights @ (runs[2] - runs[1])
-    with np.errstate(divide="ignore", invalid="ignore"):
-        drawn = np.where(lost > 0, gained / lost, np.copysign(np.inf, gained))
-        share = (runs[2] - runs[1]).mean() / (runs[0] - runs[1]).mean()
+    lost, share = weights @ cost, ratio(cost.mean(), won.mean())
+    drawn = ratio(lost, weights @ won)
     tail = (1 - coverage) / 2
     # Order statistics themselves: interpolation between infinities is no number.
     low, high = np.quantile(drawn, [tail, 1 - tail], method="closest_observation")

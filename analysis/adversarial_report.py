@@ -138,9 +138,10 @@ def correlation_table(results: AdversarialResults) -> Table:
          "dissertation"),
         rows,
         "Learned against true reward on held-out episodes of a mix of policies, from the expert's to a "
-        "uniform one; trajectories by their sums over equally long episodes. Mean over seeds and Student's "
-        "95 % interval (of one seed: drawing whole trajectories with replacement). The dissertation's (Table "
-        "7.4, Pearson) come with p-values that fit 4 to 7 points each.",
+        "uniform one; trajectories by their sums, over equally long episodes unless the task itself ends "
+        "them. Mean over seeds and Student's 95 % interval (of one seed: drawing whole trajectories with "
+        "replacement). The dissertation's (Table 7.4, Pearson) come with p-values that fit 4 to 7 points "
+        "each.",
     )  # fmt: skip
 
 

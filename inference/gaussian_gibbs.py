@@ -189,7 +189,9 @@ def _log_acceptance(
 
 
 class GaussianGibbs(NamedTuple):
-    """``init(recording) -> chain`` and ``refresh(chain, policy, key, sensor) -> (chain, truths)``.
+    """``init(recording, sensor) -> chain``, ``refresh(chain, policy, key, sensor) -> (chain, truths)``.
+
+    A learner takes it where it takes a :class:`GaussianTruth`.
 
     Fields
     ------
@@ -202,8 +204,9 @@ class GaussianGibbs(NamedTuple):
     truth: GaussianTruth
     sweeps: int = 10
 
-    def init(self, reported: Recording) -> GibbsChain:
-        """Every chain starts at the reports."""
+    def init(self, reported: Recording, sensor: GaussianSensor | None = None) -> GibbsChain:
+        """Every chain starts at the reports, whatever the sensor."""
+        del sensor
         shape = (self.truth.draws, 1, 1, 1)
         return GibbsChain(
             reported,

@@ -43,7 +43,7 @@ class Smoothed(NamedTuple):
 
     Fields
     ------
-    truth : GaussianTruth, CandidateTruth or PartitionTruth, with the dynamics
+    truth : GaussianTruth, GaussianGibbs, CandidateTruth or PartitionTruth, with the dynamics
     sensor : the sensor it is about
     passes : int
         Relinearisations of the first look at a recording; later looks, which go on from it, make one.
@@ -148,7 +148,7 @@ def robust_airl(
     Parameters
     ----------
     generator : PPO, or as :func:`~i2rl.inference.adversarial_learner.adversarial` takes it
-    truth : GaussianTruth, CandidateTruth or PartitionTruth
+    truth : GaussianTruth, GaussianGibbs, CandidateTruth or PartitionTruth
         With the dynamics: ``gaussian_truth(robot, robot.observation_size)``, say.
     sensor : the sensor behind the reports, such as :class:`GaussianSensor`
     discriminator, training : by default AIRL's, and :class:`AdversarialTraining`'s own

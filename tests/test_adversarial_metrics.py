@@ -345,6 +345,16 @@ def test_where_noise_may_have_cost_nothing_the_interval_has_no_end():
     assert found.high == math.inf
     with pytest.raises(ValueError, match="one number a seed"):
         recovered_share(clean, noisy[:9], robust, KEY)
+    with pytest.raises(ValueError, match="seed 1 of robust is not finite"):
+        recovered_share([1.0, 1.0], [0.0, 0.0], [0.5, np.nan], KEY)
+
+
+@pytest.mark.parametrize(("gained", "share"), [(-0.3, -math.inf), (0.3, math.inf)])
+def test_of_nothing_lost_no_share_is_won_back(gained, share):
+    # Minus 0.3 of minus 0.5 is not 60 % of a loss.
+    found = recovered_share([1.0, 1.0], [1.5, 1.5], [1.5 + gained] * 2, KEY)
+    assert found.share == found.low == found.high == share
+    assert found.lost == 0
 
 
 def test_the_interval_over_few_seeds_covers_the_mean():

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from i2rl.inference.adversarial_learner import AdversarialTraining
+from i2rl.inference.gaussian_gibbs import GaussianGibbs
 from i2rl.inference.gaussian_truth import gaussian_truth, jax_dynamics
 from i2rl.inference.hidden_truth import Smoothed, as_expert, robust_airl, robust_airl_with_sensor
 from i2rl.inference.journal import Journal, JournalError
@@ -226,3 +227,19 @@ def test_a_journal_refuses_another_sensor(generator, truth, sensor, tmp_path):
 def test_the_default_discriminator_has_the_generators_discount(task, truth, sensor):
     agent = ppo(task, n_envs=4, n_steps=32, gamma=0.9)
     assert robust_airl(agent, truth, sensor).configuration["networks"]["discount"] == 0.9
+
+
+def test_gibbs_sampling_stands_in_for_smoothing(demonstration, reports, sensor, truth, task):
+    hidden = Smoothed(GaussianGibbs(truth, sweeps=20), sensor)
+    policy = policy_network(jax.random.key(0), 2, task.actions)
+    chain = hidden.begin(reports, sensor, jax.random.key(1))
+    for i in range(3):  # chains persist
+        chain, expert = hidden.refresh(chain, sensor, policy, jax.random.key(2 + i))
+    live = np.flatnonzero(expert.live)
+    assert float(chain.chain.proposed) == 3 * 20 * 3 * 2 * 300
+
+    def error(x) -> float:
+        return float(jnp.mean((x - demonstration.observations.reshape(300, 2)[live]) ** 2))
+
+    drawn = error(expert.steps.observations[live].mean(1))
+    assert drawn < error(reports.observations.reshape(300, 2)[live])
