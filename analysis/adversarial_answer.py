@@ -25,7 +25,9 @@ def answer(
     kept: Path | None = None,
     advance: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> AdversarialResults:
-    """The study of a task with ``noise`` times its own noise. Raises ``ValueError`` for noise of zero."""
+    """The study of a task with ``noise`` times its own noise. Raises ``ValueError`` for noise of zero, and
+    for a domain that is not studied.
+    """
     if not noise > 0:
         raise ValueError(f"noise is a multiple, above zero, of the study's own; got {noise}")
     if domain == "patrol":
@@ -33,6 +35,8 @@ def answer(
 
         results = patrol_results(seeds, sessions, noise, advance=advance)
         return results._replace(machine=_machine())
+    if domain not in PLANS:
+        raise ValueError(f"the domain is one of patrol, {', '.join(PLANS)}; got {domain!r}")
     plan = _scaled(PLANS[domain], noise)
     if sessions is not None:
         plan = plan._replace(sessions=sessions)

@@ -88,7 +88,9 @@ class Outcome(NamedTuple):
 
 @lru_cache(maxsize=8)
 def learner(name: str, method: str, plan: Plan) -> Learner:
-    """The learner of a task by a method; compiled once a process."""
+    """The learner of a task by a method; compiled once a process. ``ValueError`` for another method."""
+    if method not in STUDIED:
+        raise ValueError(f"the method is one of {'; '.join(STUDIED)}; got {method!r}")
     of = case(name, plan)
     task = of.environment
     agent = ppo(task, **dict(plan.settings))
@@ -260,11 +262,13 @@ def study(
     """All seeds of all methods on one task.
 
     Runs found in ``folder`` are not run again, and new ones are kept there. Raises ``ValueError`` for another
-    name than :data:`.adversarial_cases.PLANS` has, and for fewer than one seed.
+    name than :data:`.adversarial_cases.PLANS` has, and for fewer than one seed or session.
     """
     if seeds < 1:
         raise ValueError(f"there must be at least one seed, got {seeds}")
     of = case(name, plan)
+    if of.plan.sessions < 1:
+        raise ValueError(f"there must be at least one session, got {of.plan.sessions}")
     wanted = [(method, seed) for seed in range(seeds) for method in methods]
     outcomes = {}
     for done, (which, outcome) in enumerate(_all_runs(name, wanted, of.plan, workers, folder)):

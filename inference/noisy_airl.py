@@ -289,11 +289,11 @@ def noisy_airl(
 ) -> Learner:
     """Noisy-AIRL as a learner of the session protocol; its demonstrations are :class:`Recording`.
 
-    State and report are those of :func:`.airl.adversarial`, all of it carried. ``discriminator`` is
-    :func:`.discriminator.airl_discriminator`, with ``state_only=True`` for the method as published (whose
-    discount is 1; here it must be below, for what follows termination to have a value). ``agent`` has as many
-    environments as there are noise levels, or a multiple. ``configuration`` adds to what identifies the
-    learner to a journal.
+    State and report are those of :func:`.adversarial_learner.adversarial`, all of it carried.
+    ``discriminator`` is :func:`.discriminator.airl_discriminator`, with ``state_only=True`` for the method
+    as published (whose discount is 1; here it must be below, for what follows termination to have a value).
+    ``agent`` has as many environments as there are noise levels, or a multiple. ``configuration`` adds to
+    what identifies the learner to a journal.
     """
     environment, settings = agent.environment, agent.settings
     n, size = settings.n_envs, settings.steps

@@ -267,7 +267,12 @@ class GaussianSensor(_GaussianFields):
     def sample(
         self, key: Array, observations: Float[Array, "... d"], actions: Float[Array, "... k"]
     ) -> tuple[Float[Array, "... d"], Float[Array, "... k"]]:
-        """Reports of true observations and actions."""
+        """Reports of true observations and actions; ``ValueError`` where the actions are no vectors."""
+        if actions.ndim != observations.ndim:
+            raise ValueError(
+                f"normal noise is of vectors of actions [..., k]; got {actions.shape} beside observations "
+                f"{observations.shape}"
+            )
         sensor = self.sized(observations.shape[-1], actions.shape[-1])
         key_s, key_a = jax.random.split(key)
         return (

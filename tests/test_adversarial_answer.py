@@ -12,6 +12,8 @@ import pytest
 from typer.testing import CliRunner
 
 from i2rl.analysis import adversarial_patrol
+from i2rl.analysis.adversarial_answer import answer
+from i2rl.analysis.adversarial_cases import PLANS
 from i2rl.analysis.adversarial_patrol import believed_trajectories, patrol_results
 from i2rl.analysis.adversarial_report import breach_table, learning_table
 from i2rl.analysis.adversarial_results import (
@@ -23,6 +25,7 @@ from i2rl.analysis.adversarial_results import (
     MethodResult,
     load_results,
 )
+from i2rl.analysis.adversarial_study import run, study
 from i2rl.analysis.cli import app
 from i2rl.domains.patrol import FORWARD, LEFT, RIGHT
 
@@ -132,3 +135,12 @@ def test_shares_of_few_seeds_stay_within_a_hundred_percent():
     # Student's quantile of one degree of freedom is 12.706.
     (row,) = learning_table(results).rows
     assert row[2] == f"98.0 ({98 - 12.706:.1f} to 100.0)"
+
+
+def test_studies_that_cannot_be_are_refused():
+    with pytest.raises(ValueError, match=r"domain is one of patrol, hopper.*got 'ant'"):
+        answer("ant")
+    with pytest.raises(ValueError, match="at least one session, got 0"):
+        study("mountain-car", 1, PLANS["mountain-car"]._replace(sessions=0))
+    with pytest.raises(ValueError, match=r"method is one of AIRL, clean input.*got 'AIRL'"):
+        run("mountain-car", "AIRL", 0, PLANS["mountain-car"])

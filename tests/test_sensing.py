@@ -129,3 +129,9 @@ def test_distortion_leaves_padding_alone():
     dead = ~np.asarray(r.live)
     np.testing.assert_array_equal(noisy.observations[dead], r.observations[dead])
     assert (noisy.observations != r.observations)[r.live].all()
+
+
+def test_normal_noise_is_not_added_to_numbers_of_actions():
+    numbered = recording([np.zeros((5, 2))], [np.zeros(5, int)])
+    with pytest.raises(ValueError, match=r"vectors of actions.*got \(1, 5\) beside"):
+        distort(jax.random.key(0), GaussianSensor(0.1, 0.1), numbered)

@@ -46,7 +46,7 @@ def measured(name: str) -> dict[str, float]:
     start, trained = discriminator_updates(discriminator, AdversarialTraining(updates=1, batch=PAIRS))
     memory = start(network)
     expert = as_expert(drawn)
-    flat = Transitions(*(np.asarray(x)[:, 0] for x in expert.steps))
+    flat = Transitions(*(np.asarray(x)[:, 0] for x in expert.steps))  # type: ignore[arg-type]
     replay = Transitions(*(x[None] for x in flat))
 
     def update() -> None:
