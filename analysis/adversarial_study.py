@@ -119,7 +119,7 @@ def learner(name: str, method: str, plan: Plan) -> Learner:
     return ssrr(
         agent,
         airl_discriminator(task.observation_size, task.actions, agent.settings.gamma, state_only=True),
-        NoisyTraining(rounds=half, updates=plan.updates, batch=plan.batch),
+        NoisyTraining(half, plan.updates, plan.batch, plan.learning_rate),
         SSRRTraining(_SSRR_LEVELS, 1, _REGRESSION, rounds=half, start="first"),
     )
 

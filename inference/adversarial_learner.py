@@ -199,7 +199,7 @@ class AdversarialTraining(NamedTuple):
     average: str = "log_probabilities"
     penalty: float = 1.0
     replay: int = 1
-    refresh: int = 10
+    refresh: int = 5
 
     def checked(self) -> AdversarialTraining:
         """Itself. Raises ``ValueError`` naming a field that cannot be."""
@@ -273,6 +273,7 @@ def adversarial(
             policy = acting.policy
             if expert is None or r % how.refresh == 0:
                 chain, expert = truth.refresh(chain, sensor, policy, k_truth)
+                expert = _possible(task, expert)
             before = acting.running
             acting, rollout = generator.collect(acting)
             replay = _remembered(replay, _steps(task, rollout), (rounds + r) % how.replay)
@@ -350,6 +351,14 @@ def reported_steps(recording: Recording) -> ExpertTransitions:
     steps = (observations, jnp.asarray(recording.actions), following, ends)
     flat = (x.reshape(-1, 1, *x.shape[2:]) for x in steps)
     return ExpertTransitions(Transitions(*flat), (recording.followed | ends).reshape(-1), jnp.ones(1))
+
+
+def _possible(task: Task, expert: ExpertTransitions) -> ExpertTransitions:
+    """Reported actions cut to their bounds, as generated ones are.
+
+    Noise beyond the bounds would tell the two apart whatever either does.
+    """
+    return expert._replace(steps=expert.steps._replace(actions=task.actions.clip(expert.steps.actions)))
 
 
 def _steps(task: Task, rollout: Any) -> Transitions:

@@ -7,8 +7,9 @@ What is done about noise is one object, the learner's :class:`~i2rl.inference.ad
 :class:`SmoothedAndFitted`
     only its form is, and its parameters are fitted to each session by expectation-maximisation.
 
-Either way the truth is found under the generator's current policy, so it sharpens as the policy does, and the
-chain goes on from where the last look left it.
+Either way the truth is found under the generator's policy of the moment, every few rounds (``refresh`` of
+:class:`~i2rl.inference.adversarial_learner.AdversarialTraining`), and the chain goes on from where the last
+look at the session's reports left it.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from i2rl.inference.adversarial_learner import AdversarialTraining
+from i2rl.inference.adversarial_learner import AdversarialTraining, airl
 from i2rl.inference.gaussian_gibbs import GaussianGibbs
 from i2rl.inference.gaussian_truth import gaussian_truth, jax_dynamics
 from i2rl.inference.hidden_truth import Smoothed, as_expert, robust_airl, robust_airl_with_sensor
@@ -243,3 +243,13 @@ def test_gibbs_sampling_stands_in_for_smoothing(demonstration, reports, sensor, 
 
     drawn = error(expert.steps.observations[live].mean(1))
     assert drawn < error(reports.observations.reshape(300, 2)[live])
+
+
+def test_reported_actions_are_cut_to_what_the_generator_can_show(generator, reports):
+    # Noise beyond the bounds would tell an expert from a generator whatever they do.
+    beyond = reports._replace(actions=5 * jnp.ones_like(reports.actions))
+    cut = reports._replace(actions=jnp.ones_like(reports.actions))
+    learner = airl(generator, training=TRAINING)
+    one, _ = learner.update(learner.init(jax.random.key(0)), beyond)
+    other, _ = learner.update(learner.init(jax.random.key(0)), cut)
+    np.testing.assert_array_equal(one.weights, other.weights)
