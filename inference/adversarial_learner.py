@@ -13,13 +13,12 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ..models.extras import required
@@ -36,6 +35,7 @@ from .discriminator import (
     gail_discriminator,
     gradient_penalty,
 )
+from .discriminator_training import Objective, discriminator_updates
 from .rollouts import finished_returns
 from .session import Learner
 
@@ -238,7 +238,8 @@ def adversarial(
     task = Task(environment.name, environment.observation_size, environment.actions)
     truth = FaceValue() if truth is None else truth
     how = (training or AdversarialTraining()).checked()
-    start, trained = discriminator_updates(discriminator, how)
+    objective = discriminator_objective(discriminator, how)
+    start, trained = discriminator_updates(objective, how.updates, how.batch, how.learning_rate)
 
     @jax.jit
     def rewarded(network: ShapedReward, policy: Policy, rollout: Any) -> Float[Array, "T n"]:
@@ -253,7 +254,7 @@ def adversarial(
         k_network, k_generator, k_rest = jax.random.split(key, 3)
         network = discriminator.init(k_network)
         acting = generator.init(k_generator)
-        blank = _blank(task, (how.replay, generator.settings.steps))
+        blank = blank_steps(task, (how.replay, generator.settings.steps))
         zero = jnp.zeros((), jnp.int64)
         parts = (network, start(network), acting, blank, zero, zero, truth.prior())
         return AdversarialState(zero, k_rest, *parts)
@@ -273,10 +274,10 @@ def adversarial(
             policy = acting.policy
             if expert is None or r % how.refresh == 0:
                 chain, expert = truth.refresh(chain, sensor, policy, k_truth)
-                expert = _possible(task, expert)
+                expert = within_bounds(task, expert)
             before = acting.running
             acting, rollout = generator.collect(acting)
-            replay = _remembered(replay, _steps(task, rollout), (rounds + r) % how.replay)
+            replay = remembered(replay, _steps(task, rollout), (rounds + r) % how.replay)
             filled = min(rounds + r + 1, how.replay)
             network, memory, met = trained(network, memory, policy, expert, replay, filled, k_updates)
             acting = generator.improve(acting, rollout, rewarded(network, policy, rollout))
@@ -353,7 +354,7 @@ def reported_steps(recording: Recording) -> ExpertTransitions:
     return ExpertTransitions(Transitions(*flat), (recording.followed | ends).reshape(-1), jnp.ones(1))
 
 
-def _possible(task: Task, expert: ExpertTransitions) -> ExpertTransitions:
+def within_bounds(task: Task, expert: ExpertTransitions) -> ExpertTransitions:
     """Reported actions cut to their bounds, as generated ones are.
 
     Noise beyond the bounds would tell the two apart whatever either does.
@@ -370,7 +371,8 @@ def _steps(task: Task, rollout: Any) -> Transitions:
     )
 
 
-def _blank(task: Task, shape: tuple[int, int]) -> Transitions:
+def blank_steps(task: Task, shape: tuple[int, int]) -> Transitions:
+    """Room for generated steps, ``shape`` of them."""
     d = task.observation_size
     observations = jnp.zeros((*shape, d), DTYPE)
     if task.actions.discrete:
@@ -381,88 +383,29 @@ def _blank(task: Task, shape: tuple[int, int]) -> Transitions:
 
 
 @jax.jit
-def _remembered(replay: Transitions, new: Transitions, place: int) -> Transitions:
+def remembered(replay: Transitions, new: Transitions, place: int) -> Transitions:
+    """Generated steps with those of one round in the place of another's."""
     return Transitions(
         *(old.at[place].set(x.reshape(old.shape[1:])) for old, x in zip(replay, new, strict=True))
     )
 
 
-def _trainable(network: ShapedReward) -> tuple:
-    return network.reward, network.potential, network.absorbing
+def discriminator_objective(discriminator: Discriminator, how: AdversarialTraining) -> Objective:
+    """Cross-entropy, averaged and penalised as the training says."""
 
-
-def _with(network: ShapedReward, parameters: tuple) -> ShapedReward:
-    return eqx.tree_at(_trainable, network, parameters)
-
-
-def _normed(network: ShapedReward, *observations: Array) -> ShapedReward:
-    norm = network.norm
-    for x in observations:
-        norm = norm.update(x)
-    return eqx.tree_at(lambda net: net.norm, network, norm)
-
-
-def discriminator_updates(
-    discriminator: Discriminator, how: AdversarialTraining
-) -> tuple[Callable[[ShapedReward], Any], Callable[..., tuple[ShapedReward, Any, Losses]]]:
-    """The optimiser's first state, and all of a round's updates in one compiled program.
-
-    The second is ``(network, memory, policy, expert, replay, filled, key) -> (network, memory, losses)``:
-    ``expert`` is :class:`ExpertTransitions`, ``replay`` generated steps ``[K, B, ...]`` of which the first
-    ``filled`` rounds count, and the losses are those of the last update.
-    """
-    optimiser = optax.adam(how.learning_rate)
-
-    def start(network: ShapedReward) -> Any:
-        return optimiser.init(_trainable(network))
-
-    @jax.jit
-    def trained(
+    def objective(
         network: ShapedReward,
-        memory: Any,
         policy: Policy,
-        expert: ExpertTransitions,
-        replay: Transitions,
-        filled: int,
+        expert: Transitions,
+        weights: Float[Array, " M"],
+        generated: Transitions,
+        places: Array,
         key: Array,
-    ) -> tuple[ShapedReward, Any, Losses]:
-        # Live rows first, so that drawing one is drawing a number below their count.
-        order, count = jnp.argsort(~expert.live, stable=True), jnp.sum(expert.live)
-        recent, size = replay.terminated.shape
+    ) -> tuple[Float[Array, ""], Losses]:
+        loss, met = cross_entropy(discriminator, network, policy, expert, weights, generated, how.average)
+        if how.penalty:
+            first = Transitions(*(x[:, 0] for x in expert))
+            loss += how.penalty * gradient_penalty(discriminator, network, first, generated, key)
+        return loss, met
 
-        def drawn(key: Array) -> tuple[Transitions, Transitions]:
-            k_expert, k_generated = jax.random.split(key)
-            rows = order[jax.random.randint(k_expert, (how.batch,), 0, count)]
-            places = jax.random.randint(k_generated, (how.batch,), 0, filled * size)
-            flat = Transitions(*(x.reshape(recent * size, *x.shape[2:]) for x in replay))
-            return expert.steps.rows(rows), flat.rows(places)
-
-        k_norm, k_updates = jax.random.split(key)
-        ours, theirs = drawn(k_norm)
-        network = _normed(network, ours.observations[:, 0], theirs.observations)
-
-        def step(carry: tuple, key: Array) -> tuple:
-            parameters, memory = carry
-            k_batch, k_penalty = jax.random.split(key)
-            ours, theirs = drawn(k_batch)
-
-            def objective(parameters: tuple) -> tuple[Array, Losses]:
-                net = _with(network, parameters)
-                loss, met = cross_entropy(
-                    discriminator, net, policy, ours, expert.weights.astype(jnp.float32), theirs, how.average
-                )
-                if how.penalty:
-                    first = Transitions(*(x[:, 0] for x in ours))
-                    loss += how.penalty * gradient_penalty(discriminator, net, first, theirs, k_penalty)
-                return loss, met
-
-            slope, met = jax.grad(objective, has_aux=True)(parameters)
-            change, memory = optimiser.update(slope, memory, parameters)
-            return (optax.apply_updates(parameters, change), memory), met
-
-        keys = jax.random.split(k_updates, how.updates)
-        every: Losses
-        (parameters, memory), every = lax.scan(step, (_trainable(network), memory), keys)
-        return _with(network, parameters), memory, jax.tree.map(lambda x: x[-1], every)
-
-    return start, trained
+    return objective

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ..models.networks import ActionSpace, Policy, ShapedReward
 
@@ -208,17 +208,20 @@ def cross_entropy(
     weights: Float[Array, " M"],
     generated: Transitions,
     average: str = "log_probabilities",
+    importance: ArrayLike = 1.0,
 ) -> tuple[Float[Array, ""], Losses]:
     """Mean cross-entropy over expert steps ``[B, M]`` and generated steps ``[B]``, in nats per step.
 
-    Steps in the absorbing state count once for each episode that ended.
+    Steps in the absorbing state count once for each episode that ended. ``importance`` weighs generated steps
+    ``[B]`` that were not drawn from the policy alone.
     """
     of_expert = discriminator.logits(network, policy, expert)
     of_generated = discriminator.logits(network, policy, generated)
     absorbed = network.absorbing
-    loss = -jnp.mean(AVERAGES[average](of_expert, weights)) - jnp.mean(jax.nn.log_sigmoid(-of_generated))
+    loss = -jnp.mean(AVERAGES[average](of_expert, weights))
+    loss -= jnp.mean(importance * jax.nn.log_sigmoid(-of_generated))
     loss -= jnp.mean(expert.terminated @ weights) * jax.nn.log_sigmoid(absorbed)
-    loss -= jnp.mean(generated.terminated) * jax.nn.log_sigmoid(-absorbed)
+    loss -= jnp.mean(importance * generated.terminated) * jax.nn.log_sigmoid(-absorbed)
     right = Losses(0.5 * loss, jnp.mean((of_expert > 0) @ weights), jnp.mean(of_generated < 0))
     return 0.5 * loss, right
 

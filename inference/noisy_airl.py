@@ -15,7 +15,7 @@ the executed action are what the mixture asks for: ``E_executed[w g] = E_policy[
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -33,14 +33,13 @@ from .adversarial_learner import (
     AdversarialReport,
     AdversarialState,
     Task,
-    _blank,
-    _normed,
-    _remembered,
-    _trainable,
-    _with,
+    blank_steps,
+    remembered,
     reported_steps,
+    within_bounds,
 )
-from .discriminator import Discriminator, ExpertTransitions, Losses, Transitions
+from .discriminator import Discriminator, ExpertTransitions, Losses, Transitions, cross_entropy
+from .discriminator_training import Objective, discriminator_updates
 from .ppo import PPO, PPOState
 from .rollouts import Running, finished_returns, roll_out
 from .session import Learner
@@ -205,31 +204,6 @@ def _compiled(
     return running, NoisyRollout(rollout, executed)
 
 
-# -- the discriminator's objective --------------------------------------------------------------------------
-
-
-def weighted_cross_entropy(
-    discriminator: Discriminator,
-    network: ShapedReward,
-    policy: Policy,
-    expert: Transitions,
-    generated: Transitions,
-    weights: Float[Array, " B"],
-) -> tuple[Float[Array, ""], Losses]:
-    """Mean cross-entropy over expert and generated steps ``[B]``, the latter weighted; in nats a step.
-
-    Without noise all weights are 1 and it is :func:`.discriminator.cross_entropy`. Steps in the absorbing
-    state count once for each episode that ended.
-    """
-    of_expert = discriminator.logits(network, policy, expert)
-    of_generated = discriminator.logits(network, policy, generated)
-    absorbed = network.absorbing
-    loss = -jnp.mean(jax.nn.log_sigmoid(of_expert)) - jnp.mean(weights * jax.nn.log_sigmoid(-of_generated))
-    loss -= jnp.mean(expert.terminated) * jax.nn.log_sigmoid(absorbed)
-    loss -= jnp.mean(weights * generated.terminated) * jax.nn.log_sigmoid(-absorbed)
-    return 0.5 * loss, Losses(0.5 * loss, jnp.mean(of_expert > 0), jnp.mean(of_generated < 0))
-
-
 @jax.jit
 def action_log_likelihood(policy: Policy, expert: ExpertTransitions) -> Float[Array, ""]:
     """Mean log-likelihood of the expert's reported actions, nats a step."""
@@ -300,8 +274,9 @@ def noisy_airl(
     how = (training or NoisyTraining()).checked(n)
     levels = jnp.tile(jnp.asarray(how.levels, DTYPE), n // len(how.levels))
     task = Task(environment.name, environment.observation_size, environment.actions)
-    optimiser = optax.adam(how.learning_rate)
-    trained = _discriminator_updates(discriminator, optimiser, how, levels)
+    start, trained = discriminator_updates(
+        _objective(discriminator, levels), how.updates, how.batch, how.learning_rate
+    )
 
     @jax.jit
     def rewarded(network: ShapedReward, policy: Policy, noisy: NoisyRollout) -> Float[Array, "T n"]:
@@ -315,9 +290,9 @@ def noisy_airl(
             session=zero,
             key=key,
             network=network,
-            optimiser=optimiser.init(_trainable(network)),
+            optimiser=start(network),
             generator=agent.init(k_agent),
-            replay=_blank(task, (how.replay, size)),
+            replay=blank_steps(task, (how.replay, size)),
             rounds=zero,
             pairs=zero,
             sensor=(),
@@ -326,7 +301,7 @@ def noisy_airl(
     def update(state: AdversarialState, recording: Recording) -> tuple[AdversarialState, AdversarialReport]:
         began = time.perf_counter()
         task.require(recording)
-        expert = reported_steps(recording)
+        expert = within_bounds(task, reported_steps(recording))
         key, network, memory = state.key, state.network, state.optimiser
         acting, replay, rounds = state.generator, state.replay, int(state.rounds)
         losses, returns = [], []
@@ -334,7 +309,7 @@ def noisy_airl(
             key, k_collect, k_updates = jax.random.split(key, 3)
             before = acting.running
             acting, noisy = _acted(agent, acting, levels, k_collect)
-            replay = _remembered(replay, noisy.steps(how.shown), rounds % how.replay)
+            replay = remembered(replay, noisy.steps(how.shown), rounds % how.replay)
             rounds += 1
             network, memory, last = trained(
                 network, memory, acting.policy, expert, replay, min(rounds, how.replay), k_updates
@@ -392,56 +367,21 @@ def _within(actions: ActionSpace, steps: Transitions) -> Transitions:
     return steps._replace(actions=actions.clip(steps.actions))
 
 
-def _discriminator_updates(
-    discriminator: Discriminator, optimiser: Any, how: NoisyTraining, levels: Float[Array, " n"]
-) -> Callable[..., tuple[ShapedReward, Any, Losses]]:
-    """All of a round's updates in one compiled program; the losses are those of the last."""
-
-    @jax.jit
-    def trained(
+def _objective(discriminator: Discriminator, levels: Float[Array, " n"]) -> Objective:
+    def objective(
         network: ShapedReward,
-        memory: Any,
         policy: Policy,
-        expert: ExpertTransitions,
-        replay: Transitions,
-        filled: int,
+        expert: Transitions,
+        weights: Float[Array, " M"],
+        generated: Transitions,
+        places: Array,
         key: Array,
-    ) -> tuple[ShapedReward, Any, Losses]:
-        # Live rows first, so that drawing one is drawing a number below their count.
-        order, count = jnp.argsort(~expert.live, stable=True), jnp.sum(expert.live)
-        shown = Transitions(*(x[:, 0] for x in expert.steps))
-        size = replay.terminated.shape[1]
-        stored = Transitions(*(x.reshape(-1, *x.shape[2:]) for x in replay))
+    ) -> tuple[Float[Array, ""], Losses]:
+        # A stored step's place is (round * T + step) * n + environment.
+        at = levels[places % levels.shape[0]]
+        # Weights are of the action as drawn: beyond the bounds it cannot have been a random one.
+        importance = importance_weights(policy, generated.observations, generated.actions, at)
+        shown = _within(network.actions, generated)
+        return cross_entropy(discriminator, network, policy, expert, weights, shown, importance=importance)
 
-        def drawn(key: Array) -> tuple[Transitions, Transitions, Array]:
-            k_expert, k_generated = jax.random.split(key)
-            rows = order[jax.random.randint(k_expert, (how.batch,), 0, count)]
-            places = jax.random.randint(k_generated, (how.batch,), 0, filled * size)
-            # A stored step's place is (round * T + step) * n + environment.
-            return shown.rows(rows), stored.rows(places), levels[places % levels.shape[0]]
-
-        k_norm, k_updates = jax.random.split(key)
-        ours, theirs, _ = drawn(k_norm)
-        network = _normed(network, ours.observations, theirs.observations)
-
-        def step(carry: tuple, key: Array) -> tuple:
-            parameters, memory = carry
-            ours, theirs, at = drawn(key)
-            # Weights are of the action as drawn: beyond the bounds it cannot have been a random one.
-            weights = importance_weights(policy, theirs.observations, theirs.actions, at)
-            theirs = _within(network.actions, theirs)
-
-            def objective(parameters: tuple) -> tuple[Array, Losses]:
-                net = _with(network, parameters)
-                return weighted_cross_entropy(discriminator, net, policy, ours, theirs, weights)
-
-            slope, met = jax.grad(objective, has_aux=True)(parameters)
-            change, memory = optimiser.update(slope, memory, parameters)
-            return (optax.apply_updates(parameters, change), memory), met
-
-        keys = jax.random.split(k_updates, how.updates)
-        each: Losses
-        (parameters, memory), each = lax.scan(step, (_trainable(network), memory), keys)
-        return _with(network, parameters), memory, Losses(*(x[-1] for x in each))
-
-    return trained
+    return objective

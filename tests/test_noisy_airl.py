@@ -16,7 +16,6 @@ from i2rl.inference.noisy_airl import (
     log_uniform,
     noisy_airl,
     roll_out_noisily,
-    weighted_cross_entropy,
 )
 from i2rl.inference.ppo import ppo
 from i2rl.inference.rollouts import begin
@@ -170,25 +169,19 @@ def classified():
     return discriminator, network, parts(Drifting())[0], steps(30), steps(30)
 
 
-def test_without_noise_the_objective_is_that_of_airl(classified):
-    discriminator, network, policy, expert, generated = classified
-    ours, met = weighted_cross_entropy(*classified, jnp.ones(30))
-    sampled = Transitions(*(x[:, None] for x in expert))
-    theirs, also = cross_entropy(discriminator, network, policy, sampled, jnp.ones(1), generated)
-    np.testing.assert_allclose(ours, theirs, rtol=1e-6)
-    np.testing.assert_allclose(met, also, rtol=1e-6)
-
-
 def test_weighted_steps_count_as_often_as_their_weight_says(classified):
     discriminator, network, policy, expert, generated = classified
+    sampled = Transitions(*(x[:, None] for x in expert))
     copies = np.random.default_rng(2).integers(0, 4, 30)
-    weighted, _ = weighted_cross_entropy(*classified, jnp.asarray(copies, jnp.float32))
     repeated = generated.rows(np.repeat(np.arange(30), copies))
-    none, _ = weighted_cross_entropy(*classified, jnp.zeros(30))
-    plain, _ = weighted_cross_entropy(
-        discriminator, network, policy, expert, repeated, jnp.ones(copies.sum())
-    )
-    np.testing.assert_allclose(weighted - none, (plain - none) * copies.sum() / 30, rtol=1e-5)
+
+    def loss(steps, importance):
+        known = discriminator, network, policy, sampled, jnp.ones(1), steps
+        return cross_entropy(*known, importance=importance)[0]
+
+    none = loss(generated, jnp.zeros(30))
+    weighted = loss(generated, jnp.asarray(copies, jnp.float32)) - none
+    np.testing.assert_allclose(weighted, (loss(repeated, 1.0) - none) * copies.sum() / 30, rtol=1e-5)
 
 
 # -- the learner ------------------------------------------------------------------------------------------

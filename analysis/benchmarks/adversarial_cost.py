@@ -18,8 +18,9 @@ import numpy as np
 
 from ...domains.experts import load_expert
 from ...domains.onion_reaching import demonstrate_onions
-from ...inference.adversarial_learner import AdversarialTraining, discriminator_updates
+from ...inference.adversarial_learner import AdversarialTraining, discriminator_objective
 from ...inference.discriminator import Transitions, airl_discriminator
+from ...inference.discriminator_training import discriminator_updates
 from ...inference.hidden_truth import as_expert
 from ...models.networks import policy_network
 from ...models.sensing import Recording, distort
@@ -43,7 +44,9 @@ def measured(name: str) -> dict[str, float]:
     chain, drawn = truth.refresh(truth.init(reported, of.sensor), policy, jax.random.key(1), of.sensor)
     discriminator = airl_discriminator(task.observation_size, task.actions)
     network = discriminator.init(jax.random.key(2))
-    start, trained = discriminator_updates(discriminator, AdversarialTraining(updates=1, batch=PAIRS))
+    start, trained = discriminator_updates(
+        discriminator_objective(discriminator, AdversarialTraining()), 1, PAIRS, 1e-3
+    )
     memory = start(network)
     expert = as_expert(drawn)
     flat = Transitions(*(np.asarray(x)[:, 0] for x in expert.steps))  # type: ignore[arg-type]
