@@ -126,9 +126,9 @@ def case(name: str, plan: Plan | None = None) -> Case:
 
 
 PLANS = {
-    "hopper": Plan(),
-    "walker2d": Plan(),
-    "half-cheetah": Plan(),
+    "hopper": Plan(sessions=12),
+    "walker2d": Plan(sessions=18),
+    "half-cheetah": Plan(process=1e-3),
     "mountain-car": Plan(
         sessions=20,
         rounds=10,
