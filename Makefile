@@ -65,4 +65,4 @@ $(PEERS)/.installed: Makefile
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(PEERS) build report report-labyrinth
+	rm -rf $(VENV) $(PEERS) build report report-*

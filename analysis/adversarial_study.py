@@ -191,10 +191,7 @@ def _held_out(name: str, plan: Plan) -> tuple[Trajectories, np.ndarray]:
 
 
 def _learned_reward(network: Any, observations: ArrayLike, actions: ArrayLike) -> np.ndarray:
-    """Of state and action, or, as SSRR's, of the state alone."""
-    seen = jnp.asarray(observations)
-    found = network(seen) if type(network).__name__ == "SSRRReward" else network(seen, jnp.asarray(actions))
-    return np.asarray(found, float)
+    return np.asarray(network(jnp.asarray(observations), jnp.asarray(actions)), float)
 
 
 def _scatter(name: str, plan: Plan, network: Any, seed: int) -> RewardScatter:
@@ -224,8 +221,9 @@ def _belief(of: Case, policy: Any, truth: Recording, reported: Recording) -> Bel
         observations, actions, live = (x[:1, :steps] for x in recording[:3])
         return Recording(observations, actions, live, jnp.zeros(1, bool))
 
-    begun = Smoothed(of.truth(draws=64), of.sensor).begin(first(reported), of.sensor, jax.random.key(0))
-    _, drawn = Smoothed(of.truth(draws=64), of.sensor).refresh(begun, of.sensor, policy, jax.random.key(0))
+    hidden = Smoothed(of.truth(draws=64), of.sensor)
+    begun = hidden.begin(first(reported), of.sensor, jax.random.key(0))
+    _, drawn = hidden.refresh(begun, of.sensor, policy, jax.random.key(0))
     d = truth.observations.shape[-1]
 
     def picked(observations: Any, actions: Any) -> np.ndarray:

@@ -245,11 +245,6 @@ def adversarial(
     def rewarded(network: ShapedReward, policy: Policy, rollout: Any) -> Float[Array, "T n"]:
         return discriminator.rewards(network, policy, _steps(task, rollout))
 
-    @jax.jit
-    def likelihood(policy: Policy, expert: ExpertTransitions) -> Float[Array, ""]:
-        each = policy.log_prob(expert.steps.observations, expert.steps.actions) @ expert.weights
-        return jnp.sum(jnp.where(expert.live, each, 0)) / jnp.sum(expert.live)
-
     def init(key: Array) -> AdversarialState:
         k_network, k_generator, k_rest = jax.random.split(key, 3)
         network = discriminator.init(k_network)
@@ -299,29 +294,9 @@ def adversarial(
             pairs,
             sensor,
         )
-        every: Losses = jax.tree.map(lambda *x: np.asarray(x, np.float64), *losses)
-        report = AdversarialReport(
-            session=int(state.session),
-            log_likelihood=float(likelihood(acting.policy, expert)),
-            **every._asdict(),
-            returns=np.asarray(returns, np.float64),
-            pairs=int(pairs),
-            environment_steps=rounds * int(np.prod(replay.terminated.shape[1:])),
-            iterations=how.rounds,
-            sensor=jax.tree.map(np.asarray, sensor),
-            seconds=time.perf_counter() - began,
-            weights=state.weights,
-        )
-        return state, report
+        return state, session_report(state, expert, losses, returns, began)
 
-    settings = {
-        "discriminator": discriminator.name,
-        "networks": dict(discriminator.settings),
-        "horizon": environment.horizon,
-        "agent": generator.settings._asdict(),
-        **how._asdict(),
-        **dict(configuration or {}),
-    }
+    settings = {**identity(generator, discriminator), **how._asdict(), **dict(configuration or {})}
     return Learner(name, task, settings, init, update)  # type: ignore[arg-type]
 
 
@@ -342,6 +317,46 @@ def gail(generator: Any, *, training: AdversarialTraining | None = None, **netwo
 
 
 # -- a round's parts ------------------------------------------------------------------------------------
+
+
+@jax.jit
+def action_log_likelihood(policy: Policy, expert: ExpertTransitions) -> Float[Array, ""]:
+    """Mean log-likelihood of the expert's actions, nats a step, over the truth's samples."""
+    each = policy.log_prob(expert.steps.observations, expert.steps.actions) @ expert.weights
+    return jnp.sum(jnp.where(expert.live, each, 0)) / jnp.sum(expert.live)
+
+
+def session_report(
+    state: AdversarialState,
+    expert: ExpertTransitions,
+    losses: Sequence[Losses],
+    returns: Sequence[float],
+    began: float,
+) -> AdversarialReport:
+    """What a session did, from the state after it, its last look at the expert, and its rounds' measures."""
+    every: Losses = jax.tree.map(lambda *x: np.asarray(x, np.float64), *losses)
+    return AdversarialReport(
+        session=int(state.session),
+        log_likelihood=float(action_log_likelihood(state.generator.policy, expert)),
+        **every._asdict(),
+        returns=np.asarray(returns, np.float64),
+        pairs=int(state.pairs),
+        environment_steps=int(state.rounds) * int(np.prod(state.replay.terminated.shape[1:])),
+        iterations=len(losses),
+        sensor=jax.tree.map(np.asarray, state.sensor),
+        seconds=time.perf_counter() - began,
+        weights=state.weights,
+    )
+
+
+def identity(generator: Any, discriminator: Discriminator) -> dict[str, Any]:
+    """What tells a journal two learners' parts apart."""
+    return {
+        "discriminator": discriminator.name,
+        "networks": dict(discriminator.settings),
+        "horizon": generator.environment.horizon,
+        "agent": generator.settings._asdict(),
+    }
 
 
 def reported_steps(recording: Recording) -> ExpertTransitions:

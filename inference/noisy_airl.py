@@ -34,11 +34,13 @@ from .adversarial_learner import (
     AdversarialState,
     Task,
     blank_steps,
+    identity,
     remembered,
     reported_steps,
+    session_report,
     within_bounds,
 )
-from .discriminator import Discriminator, ExpertTransitions, Losses, Transitions, cross_entropy
+from .discriminator import Discriminator, Losses, Transitions, cross_entropy
 from .discriminator_training import Objective, discriminator_updates
 from .ppo import PPO, PPOState
 from .rollouts import Running, finished_returns, roll_out
@@ -204,13 +206,6 @@ def _compiled(
     return running, NoisyRollout(rollout, executed)
 
 
-@jax.jit
-def action_log_likelihood(policy: Policy, expert: ExpertTransitions) -> Float[Array, ""]:
-    """Mean log-likelihood of the expert's reported actions, nats a step."""
-    each = policy.log_prob(expert.steps.observations, expert.steps.actions) @ expert.weights
-    return jnp.sum(jnp.where(expert.live, each, 0)) / jnp.sum(expert.live)
-
-
 # -- the learner ------------------------------------------------------------------------------------------
 
 
@@ -329,29 +324,10 @@ def noisy_airl(
             pairs=state.pairs + int(np.sum(recording.live)),
             sensor=(),
         )
-        met: Losses = jax.tree.map(lambda *x: np.asarray(x, np.float64), *losses)
-        report = AdversarialReport(
-            session=int(state.session),
-            log_likelihood=float(action_log_likelihood(acting.policy, expert)),
-            **met._asdict(),
-            returns=np.asarray(returns, np.float64),
-            pairs=int(state.pairs),
-            environment_steps=rounds * size,
-            iterations=how.rounds,
-            sensor=(),
-            seconds=time.perf_counter() - began,
-            weights=state.weights,
-        )
-        return state, report
+        return state, session_report(state, expert, losses, returns, began)
 
-    known = {
-        "discriminator": discriminator.name,
-        "networks": dict(discriminator.settings),
-        "horizon": environment.horizon,
-        "agent": settings._asdict(),
-        **how._asdict(),
-    }
-    return Learner("noisy-AIRL", task, {**known, **dict(configuration or {})}, init, update)  # type: ignore[arg-type]
+    known = {**identity(agent, discriminator), **how._asdict(), **dict(configuration or {})}
+    return Learner("noisy-AIRL", task, known, init, update)  # type: ignore[arg-type]
 
 
 def _acted(

@@ -1,6 +1,7 @@
 """AIRL on patrol through reports that err, and GAIL on patrol through a view that hides (7.4.3 and 7.4.1).
 
-``python -m i2rl.analysis.benchmarks.adversarial_patrol`` writes ``build/bench/adversarial_patrol.json``:
+``python -m i2rl.analysis.benchmarks.adversarial_patrol`` writes ``build/bench/adversarial_patrol.json`` and,
+beside it, figures (``patrol-view`` is to be seen beside Figure 7.4(c)):
 
 - *noise*: instance 2, its greedy expert (the dissertation's is a rule by hand), trajectories of 8 pairs from
   anywhere, sessions of 32 to 128 pairs. Moving forward is reported as turning left, and turning right as
@@ -46,7 +47,17 @@ from ..adversarial_patrol import (
     outcome_of,
     success_rates,
 )
-from ..adversarial_patrol_figures import CLEAN, GAIL, LAST, LEARNED, LME, NOISY, ROBUST, ROBUST_GAIL
+from ..adversarial_patrol_figures import (
+    CLEAN,
+    GAIL,
+    LAST,
+    LEARNED,
+    LME,
+    NOISY,
+    ROBUST,
+    ROBUST_GAIL,
+    write_figures,
+)
 from .harness import DEFAULT_FOLDER, machine, print_table, seconds
 
 LEVELS = (0.05, 0.1, 0.2, 0.3)
@@ -246,6 +257,8 @@ def main() -> None:
     if given.part != "noise":
         view_study(file, runs=max(given.runs // 4, 1), sessions=given.view_sessions, rounds=given.rounds)
     _print(file.results)
+    for path in write_figures(file.results, given.out.parent):
+        print(f"Written to {path}")
 
 
 if __name__ == "__main__":
