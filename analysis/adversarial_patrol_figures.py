@@ -152,7 +152,9 @@ def view_curves(results: Results, theme: Theme, gail_memory: float = 0.0) -> Fig
             if view != 100:
                 lost = (full - accuracy) / full
                 _draw_mean(panels[1, column], theme, i, f"{view} % in view", x, lost)
-        dress(panels[0, column], theme, title=name if name == LME else _with_memory(name, memory))
+        # A line for each part of a name, or the titles of neighbours meet.
+        told = name if name == LME else _with_memory(name, memory).replace(", ", "\n", 1)
+        dress(panels[0, column], theme, title=told)
         dress(panels[1, column], theme, x="trajectories seen")
         panels[1, column].axhline(0, color=theme.muted, linewidth=0.9)
         set_scale(panels[1, column], "x", "log")
