@@ -11,7 +11,6 @@ _HOMES = {
         "AdversarialReport",
         "AdversarialState",
         "AdversarialTraining",
-        "FaceValue",
         "adversarial",
         "airl",
         "gail",
@@ -160,6 +159,7 @@ _HOMES = {
         "TabularAdversarialState",
         "TabularTraining",
     ),
+    "truth_sampling": ("FaceValue",),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME_OF)

@@ -13,8 +13,9 @@ from __future__ import annotations
 import hashlib
 import json
 import time
-from collections.abc import Mapping
-from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -38,6 +39,7 @@ from .discriminator import (
 from .discriminator_training import Objective, discriminator_updates
 from .rollouts import finished_returns
 from .session import Learner
+from .truth_sampling import FaceValue, Truth, look, within_bounds
 
 if TYPE_CHECKING:
     import equinox as eqx
@@ -68,22 +70,6 @@ class Task(NamedTuple):
     def fingerprint(self) -> str:
         """Digest of all fields."""
         return hashlib.sha256(json.dumps(tuple(self)).encode()).hexdigest()
-
-
-class Truth(Protocol):
-    """What the expert did, given reports: one object for each way to deal with noise."""
-
-    def prior(self) -> Any:
-        """The sensor before the first session, as arrays (empty where there is nothing to know)."""
-
-    def begin(self, recording: Recording, sensor: Any, key: Array) -> Any:
-        """The chain's state before the first look at a session's reports."""
-
-    def refresh(self, chain: Any, sensor: Any, policy: Policy, key: Array) -> tuple[Any, ExpertTransitions]:
-        """Samples of the truth under the current policy, and the chain to go on from."""
-
-    def learned(self, chain: Any, sensor: Any) -> Any:
-        """The sensor after a session: as it was, or fitted to it."""
 
 
 class AdversarialState(NamedTuple):
@@ -136,6 +122,8 @@ class AdversarialReport(NamedTuple):
         Reported pairs, and steps of the generator, in all sessions so far.
     iterations : int
         Rounds of this session.
+    samplings : int ``[k]``
+        Of the truth, in each look at it.
     sensor : the truth's sensor after the session
     seconds : float
     weights : float ``[P]``
@@ -150,31 +138,10 @@ class AdversarialReport(NamedTuple):
     pairs: int
     environment_steps: int
     iterations: int
+    samplings: Int[np.ndarray, " k"]
     sensor: Any
     seconds: float
     weights: Float[np.ndarray, " P"]
-
-
-class FaceValue:
-    """Reports taken for the truth: AIRL and GAIL as they are, on clean or noisy input."""
-
-    def prior(self) -> tuple:
-        """Nothing."""
-        return ()
-
-    def begin(self, recording: Recording, sensor: tuple, key: Array) -> Recording:
-        """The reports."""
-        return recording
-
-    def refresh(
-        self, chain: Recording, sensor: tuple, policy: Policy, key: Array
-    ) -> tuple[Recording, ExpertTransitions]:
-        """The reports as one sample."""
-        return chain, reported_steps(chain)
-
-    def learned(self, chain: Recording, sensor: tuple) -> tuple:
-        """Nothing."""
-        return sensor
 
 
 class AdversarialTraining(NamedTuple):
@@ -190,6 +157,10 @@ class AdversarialTraining(NamedTuple):
     penalty : float, of the gradient (see :func:`gradient_penalty`)
     replay : int, rounds whose generated steps the discriminator draws from
     refresh : int, rounds between looks at the truth
+    change : float, nats; infinite for one sampling of the truth a look
+        A look samples on until the average logit of a step moves by no more (:func:`.truth_sampling.look`).
+        The dissertation's ``delta_G`` is a sum over a batch: its .1 over 256 steps is 4e-4 here.
+    samplings : int, the most in a look
     """
 
     rounds: int = 10
@@ -200,16 +171,19 @@ class AdversarialTraining(NamedTuple):
     penalty: float = 1.0
     replay: int = 1
     refresh: int = 5
+    change: float = np.inf
+    samplings: int = 20
 
     def checked(self) -> AdversarialTraining:
         """Itself. Raises ``ValueError`` naming a field that cannot be."""
-        for name in ("rounds", "updates", "batch", "replay", "refresh"):
+        for name in ("rounds", "updates", "batch", "replay", "refresh", "samplings"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if not self.learning_rate > 0:
             raise ValueError(f"learning_rate must be positive, got {self.learning_rate}")
-        if not self.penalty >= 0:
-            raise ValueError(f"penalty must not be negative, got {self.penalty}")
+        for name in ("penalty", "change"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
         if self.average not in AVERAGES:
             raise ValueError(f"average is one of {', '.join(AVERAGES)}, got {self.average!r}")
         return self
@@ -245,6 +219,11 @@ def adversarial(
     def rewarded(network: ShapedReward, policy: Policy, rollout: Any) -> Float[Array, "T n"]:
         return discriminator.rewards(network, policy, _steps(task, rollout))
 
+    @jax.jit
+    def logits_of(network: ShapedReward, policy: Policy, steps: Transitions) -> Float[Array, "N M"]:
+        cut = steps._replace(actions=task.actions.clip(steps.actions))
+        return discriminator.logits(network, policy, cut)
+
     def init(key: Array) -> AdversarialState:
         k_network, k_generator, k_rest = jax.random.split(key, 3)
         network = discriminator.init(k_network)
@@ -263,13 +242,18 @@ def adversarial(
         chain = truth.begin(recording, sensor, k_chain)
         losses: list[Losses] = []
         returns: list[float] = []
+        samplings: list[int] = []
         expert: ExpertTransitions | None = None
         for r in range(how.rounds):
             key, k_truth, k_updates = jax.random.split(key, 3)
             policy = acting.policy
             if expert is None or r % how.refresh == 0:
-                chain, expert = truth.refresh(chain, sensor, policy, k_truth)
-                expert = within_bounds(task, expert)
+                logits = partial(logits_of, network, policy)
+                chain, expert, made = look(
+                    truth, chain, sensor, policy, k_truth, logits, how.change, how.samplings
+                )
+                expert = within_bounds(task.actions, expert)
+                samplings.append(made)
             before = acting.running
             acting, rollout = generator.collect(acting)
             replay = remembered(replay, _steps(task, rollout), (rounds + r) % how.replay)
@@ -294,7 +278,7 @@ def adversarial(
             pairs,
             sensor,
         )
-        return state, session_report(state, expert, losses, returns, began)
+        return state, session_report(state, expert, losses, returns, began, samplings)
 
     settings = {**identity(generator, discriminator), **how._asdict(), **dict(configuration or {})}
     return Learner(name, task, settings, init, update)  # type: ignore[arg-type]
@@ -332,6 +316,7 @@ def session_report(
     losses: Sequence[Losses],
     returns: Sequence[float],
     began: float,
+    samplings: Sequence[int] = (1,),
 ) -> AdversarialReport:
     """What a session did, from the state after it, its last look at the expert, and its rounds' measures."""
     every: Losses = jax.tree.map(lambda *x: np.asarray(x, np.float64), *losses)
@@ -343,6 +328,7 @@ def session_report(
         pairs=int(state.pairs),
         environment_steps=int(state.rounds) * int(np.prod(state.replay.terminated.shape[1:])),
         iterations=len(losses),
+        samplings=np.asarray(samplings),
         sensor=jax.tree.map(np.asarray, state.sensor),
         seconds=time.perf_counter() - began,
         weights=state.weights,
@@ -357,24 +343,6 @@ def identity(generator: Any, discriminator: Discriminator) -> dict[str, Any]:
         "horizon": generator.environment.horizon,
         "agent": generator.settings._asdict(),
     }
-
-
-def reported_steps(recording: Recording) -> ExpertTransitions:
-    """The reports as transitions: of each trajectory all steps with a successor, or a termination."""
-    observations = jnp.asarray(recording.observations)
-    following = jnp.concatenate([observations[:, 1:], observations[:, -1:]], 1)
-    ends = recording.last & recording.terminated[:, None]
-    steps = (observations, jnp.asarray(recording.actions), following, ends)
-    flat = (x.reshape(-1, 1, *x.shape[2:]) for x in steps)
-    return ExpertTransitions(Transitions(*flat), (recording.followed | ends).reshape(-1), jnp.ones(1))
-
-
-def within_bounds(task: Task, expert: ExpertTransitions) -> ExpertTransitions:
-    """Reported actions cut to their bounds, as generated ones are.
-
-    Noise beyond the bounds would tell the two apart whatever either does.
-    """
-    return expert._replace(steps=expert.steps._replace(actions=task.actions.clip(expert.steps.actions)))
 
 
 def _steps(task: Task, rollout: Any) -> Transitions:

@@ -109,17 +109,39 @@ def robust_airl_tabular(mdp: TabularMDP, sensor: Imperfection, **options: Any) -
 
 
 def gibbs_airl_tabular(
-    mdp: TabularMDP, sensor: Imperfection, *, draws: int = 20, burn_in: int = 20, **options: Any
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    *,
+    draws: int = 20,
+    burn_in: int = 20,
+    change: float = 0.0,
+    **options: Any,
 ) -> Learner:
-    """robust-AIRL as Algorithm 3 has it: ``draws`` sweeps of the single-site sampler in every round."""
+    """robust-AIRL as Algorithm 3 has it: ``draws`` sweeps of the single-site sampler in every round.
+
+    Fewer, where the average logit of a step moves by at most ``change`` with one more (the mean over steps of
+    its absolute change). The dissertation's ``delta_G`` is the sum over a batch and as many generated steps:
+    its .1 with 1,024 steps is a ``change`` of 1e-4 here.
+    """
     if draws < 1 or burn_in < 0:
         raise ValueError(f"a sampler needs at least one draw and no negative burn-in, got {draws}, {burn_in}")
+    if not change >= 0:
+        raise ValueError(f"change must not be negative, got {change}")
     require_fitting(sensor, mdp)
 
-    def truth(key: Array, log_policy: Array, evidence: Any, seen: Demonstration, horizon: int) -> Completed:
-        return gibbs_transitions(key, mdp, log_policy, evidence, horizon, draws, burn_in)
+    def truth(
+        key: Array, log_policy: Array, evidence: Any, seen: Demonstration, horizon: int, logits: Array
+    ) -> Completed:
+        known = logits if change else None
+        return gibbs_transitions(key, mdp, log_policy, evidence, horizon, draws, burn_in, known, change)
 
-    settings = {"truth": "gibbs", "draws": draws, "burn_in": burn_in, "sensor": _digest(sensor)}
+    settings = {
+        "truth": "gibbs",
+        "draws": draws,
+        "burn_in": burn_in,
+        "change": change,
+        "sensor": _digest(sensor),
+    }
     look = _Look(truth, np.asarray(mdp.successors), sensor)
     return _learner("robust-AIRL, Gibbs", mdp, look, tabular_airl, _AIRL, options, settings)
 
@@ -172,9 +194,12 @@ _GAIL = TabularTraining(entropy=0.01, step=0.1)
 
 
 class _Look(NamedTuple):
-    """How a learner looks at reports: the truth behind them, as weights on ``successors [S, A, U]``."""
+    """How a learner looks at reports: the truth behind them, as weights on ``successors [S, A, U]``.
 
-    truth: Callable[[Array, Float[Array, "S A"], Any, Demonstration, int], Completed]
+    ``truth(key, log_policy, evidence, seen, horizon, logits)``.
+    """
+
+    truth: Callable[[Array, Float[Array, "S A"], Any, Demonstration, int, Float[Array, "S A U"]], Completed]
     successors: np.ndarray
     sensor: Imperfection | None
     learned: ConfusionNoise | None = None
@@ -182,7 +207,9 @@ class _Look(NamedTuple):
 
 
 def _exact(mdp: TabularMDP) -> Callable[..., Completed]:
-    def truth(key: Array, log_policy: Array, evidence: Any, seen: Demonstration, horizon: int) -> Completed:
+    def truth(
+        key: Array, log_policy: Array, evidence: Any, seen: Demonstration, horizon: int, logits: Array
+    ) -> Completed:
         return exact_transitions(mdp, log_policy, evidence, horizon)
 
     return truth
@@ -211,7 +238,9 @@ def _at_face_value(
 ) -> Learner:
     successors = wide_successors(mdp)
 
-    def truth(key: Array, log_policy: Array, evidence: Any, seen: Demonstration, horizon: int) -> Completed:
+    def truth(
+        key: Array, log_policy: Array, evidence: Any, seen: Demonstration, horizon: int, logits: Array
+    ) -> Completed:
         return reported_transitions(mdp, jnp.asarray(successors), log_policy, seen, horizon)
 
     return _learner(name, mdp, _Look(truth, successors, None), kind, defaults, options, {"truth": "reports"})
@@ -266,14 +295,15 @@ def _learner(
     ) -> tuple[TabularAdversarialState, Any]:
         given = None if look.sensor is None else evidence_of(mdp, look.sensor, demonstration)
 
-        def complete(key: Array, log_policy: Array, confusions: Any) -> tuple[Completed, Any]:
+        def complete(key: Array, network: Any, log_policy: Array, confusions: Any) -> tuple[Completed, Any]:
             """The truth, and the sensor's statistic with it."""
+            logits = discriminator.logits(network, log_policy, successors)
             if look.learned is None:
-                return look.truth(key, log_policy, given, demonstration, how.horizon), confusions
+                return look.truth(key, log_policy, given, demonstration, how.horizon, logits), confusions
             believed = look.learned._replace(noise=fitted_confusions(look.learned, confusions, look.trust))
             sensor = Sensor(look.sensor.presence, believed.reading)  # type: ignore[union-attr]
             evidence = evidence_of(mdp, sensor, demonstration)
-            completed = look.truth(key, log_policy, evidence, demonstration, how.horizon)
+            completed = look.truth(key, log_policy, evidence, demonstration, how.horizon, logits)
             new = confusion_counts(believed, jnp.sum(completed.steps, -1), demonstration)
             return completed, jax.tree.map(jnp.add, state.confusions, new)
 
@@ -288,7 +318,7 @@ def _learner(
 
         def round_(carry: tuple, key: Array) -> tuple:
             network, memory, log_policy, values, confusions = carry
-            completed, confusions = complete(key, log_policy, confusions)
+            completed, confusions = complete(key, network, log_policy, confusions)
             expert = blend(state.statistic, summarised(completed), how.memory)
             sides = Sides(expert, completed, generated(mdp, log_policy, expert.starts))
             (network, memory), met = cast(
@@ -303,7 +333,7 @@ def _learner(
         begun = (state.network, state.optimiser, state.log_policy, state.values, state.confusions)
         carry, met = cast(tuple, lax.scan(round_, begun, keys[2:]))
         network, memory, log_policy, values, confusions = carry
-        completed, confusions = complete(keys[1], log_policy, confusions)
+        completed, confusions = complete(keys[1], network, log_policy, confusions)
         kept = blend(state.statistic, summarised(completed), how.memory)
         own = jnp.sum(completed.log_likelihood)
         parts = (network, memory, log_policy, values, kept, confusions, state.session + 1, keys[0])

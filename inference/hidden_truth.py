@@ -70,6 +70,12 @@ class Smoothed(NamedTuple):
         found, drawn = self.truth.refresh(chain.chain, policy, key, sensor, *passes)
         return Look(found, policy), as_expert(drawn)
 
+    def more(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
+        """Draw again; where the dynamics were linearised, they stay so."""
+        if isinstance(self.truth, GaussianTruth):
+            return chain, as_expert(self.truth.resample(chain.chain, policy, key, sensor))
+        return self.refresh(chain, sensor, policy, key)
+
     def learned(self, chain: Look, sensor: Any) -> Any:
         """The sensor as it was."""
         return sensor
@@ -103,6 +109,10 @@ class SmoothedAndFitted(NamedTuple):
     def refresh(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
         """As :meth:`Smoothed.refresh`."""
         return Smoothed(self.truth, sensor, self.passes).refresh(chain, sensor, policy, key)
+
+    def more(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
+        """As :meth:`Smoothed.more`."""
+        return Smoothed(self.truth, sensor, self.passes).more(chain, sensor, policy, key)
 
     def learned(self, chain: Look, sensor: Any) -> Any:
         """The sensor under which the session's reports are likeliest."""

@@ -36,15 +36,14 @@ from .adversarial_learner import (
     blank_steps,
     identity,
     remembered,
-    reported_steps,
     session_report,
-    within_bounds,
 )
 from .discriminator import Discriminator, Losses, Transitions, cross_entropy
 from .discriminator_training import Objective, discriminator_updates
 from .ppo import PPO, PPOState
 from .rollouts import Running, finished_returns, roll_out
 from .session import Learner
+from .truth_sampling import reported_steps, within_bounds
 
 if TYPE_CHECKING:
     import optax
@@ -296,7 +295,7 @@ def noisy_airl(
     def update(state: AdversarialState, recording: Recording) -> tuple[AdversarialState, AdversarialReport]:
         began = time.perf_counter()
         task.require(recording)
-        expert = within_bounds(task, reported_steps(recording))
+        expert = within_bounds(task.actions, reported_steps(recording))
         key, network, memory = state.key, state.network, state.optimiser
         acting, replay, rounds = state.generator, state.replay, int(state.rounds)
         losses, returns = [], []

@@ -6,12 +6,13 @@ same quantities from ``n`` draws, the ``n_s`` that Lemma 2 counts.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..models.chain import Smoothed, filter_forward, sample_backward, smooth
 from ..models.demonstration import PAD, Demonstration
@@ -147,6 +148,47 @@ def gibbs_expectations(
     return collect(mdp, gibbs_posterior(key, mdp, log_policy, evidence, draws, burn_in), evidence.live)
 
 
+class _SingleSite(NamedTuple):
+    """The single-site sampler of one trajectory: a pair ``(states, actions)`` to start from, and a sweep."""
+
+    start: Callable[[Array], tuple[Array, Array]]
+    sweep: Callable[[tuple[Array, Array], Array], tuple[Array, Array]]
+
+
+def _single_site(
+    mdp: TabularMDP, log_policy: Float[Array, "S A"], e: Float[Array, "L S A"], live: Bool[Array, " L"]
+) -> _SingleSite:
+    length, n_states = live.shape[0], mdp.n_states
+    uniform = jnp.where(log_policy > -jnp.inf, 0.0, -jnp.inf)
+    log_initial = jnp.log(mdp.initial)
+    last = jnp.sum(live) - 1
+
+    def start(key: Array) -> tuple[Array, Array]:
+        return sample_backward(key, mdp, e + uniform, filter_forward(mdp, e + uniform, live), live)
+
+    def site(carry: tuple, inputs: tuple) -> tuple:
+        states, actions = carry
+        t, key = inputs
+        state_key, action_key = jax.random.split(key)
+        before = states[jnp.maximum(t - 1, 0)], actions[jnp.maximum(t - 1, 0)]
+        arrive = jnp.zeros(n_states).at[mdp.successors[before]].add(mdp.probabilities[before])
+        arrive = jnp.where(t == 0, log_initial, jnp.log(arrive))
+        leave = jnp.log(mdp.transition_probability(states[jnp.minimum(t + 1, length - 1)]))
+        onward = jnp.where(t < last, leave, 0.0)
+        joint = arrive[:, None] + log_policy + e[t] + onward
+        state = jax.random.categorical(state_key, joint[:, actions[t]])
+        action = jax.random.categorical(action_key, joint[state])
+        alive = live[t]
+        states = states.at[t].set(jnp.where(alive, state, states[t]))
+        actions = actions.at[t].set(jnp.where(alive, action, actions[t]))
+        return (states, actions), None
+
+    def sweep(pair: tuple[Array, Array], key: Array) -> tuple[Array, Array]:
+        return lax.scan(site, pair, (jnp.arange(length), jax.random.split(key, length)))[0]
+
+    return _SingleSite(start, sweep)
+
+
 def gibbs_completions(
     key: Array,
     mdp: TabularMDP,
@@ -162,43 +204,81 @@ def gibbs_completions(
     mixes poorly or not at all: an inherent limit of the sampler, and why it is not the default. The chain
     starts from a completion drawn under the uniform policy over the actions that ``log_policy`` may take.
     """
-    n_states = mdp.n_states
-    uniform = jnp.where(log_policy > -jnp.inf, 0.0, -jnp.inf)
-    log_initial = jnp.log(mdp.initial)
 
     def chain(key: Array, e: Array, live: Array) -> tuple:
-        length = live.shape[0]
         start_key, key = jax.random.split(key)
-        filtered = filter_forward(mdp, e + uniform, live)
-        states, actions = sample_backward(start_key, mdp, e + uniform, filtered, live)
-        last = jnp.sum(live) - 1
+        site = _single_site(mdp, log_policy, e, live)
 
-        def site(carry: tuple, inputs: tuple) -> tuple:
-            states, actions = carry
-            t, key = inputs
-            state_key, action_key = jax.random.split(key)
-            before = states[jnp.maximum(t - 1, 0)], actions[jnp.maximum(t - 1, 0)]
-            arrive = jnp.zeros(n_states).at[mdp.successors[before]].add(mdp.probabilities[before])
-            arrive = jnp.where(t == 0, log_initial, jnp.log(arrive))
-            leave = jnp.log(mdp.transition_probability(states[jnp.minimum(t + 1, length - 1)]))
-            onward = jnp.where(t < last, leave, 0.0)
-            joint = arrive[:, None] + log_policy + e[t] + onward
-            state = jax.random.categorical(state_key, joint[:, actions[t]])
-            action = jax.random.categorical(action_key, joint[state])
-            alive = live[t]
-            states = states.at[t].set(jnp.where(alive, state, states[t]))
-            actions = actions.at[t].set(jnp.where(alive, action, actions[t]))
-            return (states, actions), None
+        def kept(pair: tuple, key: Array) -> tuple:
+            pair = site.sweep(pair, key)
+            return pair, pair
 
-        def sweep(carry: tuple, key: Array) -> tuple:
-            carry, _ = lax.scan(site, carry, (jnp.arange(length), jax.random.split(key, length)))
-            return carry, carry
-
-        _, (states, actions) = lax.scan(sweep, (states, actions), jax.random.split(key, draws + burn_in))
-        return states[burn_in:], actions[burn_in:]
+        every = jax.random.split(key, draws + burn_in)
+        pairs: tuple[Array, Array] = lax.scan(kept, site.start(start_key), every)[1]
+        return pairs[0][burn_in:], pairs[1][burn_in:]
 
     keys = jax.random.split(key, evidence.live.shape[0])
     return jax.vmap(chain, out_axes=1)(keys, *evidence)
+
+
+class Settled(NamedTuple):
+    """Completions drawn until an average of them settled.
+
+    Fields
+    ------
+    states, actions : int ``[draws, n, L]``
+        Those from ``drawn`` on were not drawn.
+    drawn : int
+    """
+
+    states: Int[Array, "draws n L"]
+    actions: Int[Array, "draws n L"]
+    drawn: Int[Array, ""]
+
+
+def settled_completions(
+    key: Array,
+    mdp: TabularMDP,
+    log_policy: Float[Array, "S A"],
+    evidence: Evidence,
+    draws: int,
+    burn_in: int,
+    score: Callable[[Int[Array, "n L"], Int[Array, "n L"]], Float[Array, "n L"]],
+    change: ArrayLike,
+) -> Settled:
+    """The first of :func:`gibbs_completions`, until one more hardly moves the average of ``score``.
+
+    Lines 6-15 of Algorithm 3: drawing ends where the running average over completions moves by at most
+    ``change``, the mean of its absolute changes over the steps that exist; otherwise after ``draws``. The
+    algorithm as printed compares an average with itself; here it is compared with the one before.
+    """
+    n, length = evidence.live.shape
+    keys = jax.vmap(jax.random.split)(jax.random.split(key, n))
+    sweeps = jax.vmap(lambda k: jax.random.split(k, draws + burn_in))(keys[:, 1])
+    steps = jnp.maximum(jnp.sum(evidence.live), 1)
+
+    def swept(pair: tuple, i: Array) -> tuple:
+        return jax.vmap(lambda e, live, *rest: _single_site(mdp, log_policy, e, live).sweep(*rest))(
+            *evidence, pair, sweeps[:, i]
+        )
+
+    def unsettled(carry: tuple) -> Array:
+        return (carry[0] < draws) & (carry[1] > change)
+
+    def one_more(carry: tuple) -> tuple:
+        i, _, pair, total, states, actions = carry
+        pair = swept(pair, burn_in + i)
+        value = jnp.where(evidence.live, score(*pair), 0.0)
+        moved = jnp.abs((total + value) / (i + 1) - total / jnp.maximum(i, 1))
+        moved = jnp.where(i > 0, jnp.sum(moved) / steps, jnp.inf)
+        return i + 1, moved, pair, total + value, states.at[i].set(pair[0]), actions.at[i].set(pair[1])
+
+    pair = jax.vmap(lambda k, e, live: _single_site(mdp, log_policy, e, live).start(k))(keys[:, 0], *evidence)
+    pair = lax.fori_loop(0, burn_in, lambda i, pair: swept(pair, jnp.asarray(i)), pair)
+    room = [jnp.zeros((draws, n, length), x.dtype) for x in pair]
+    begun = (jnp.zeros((), int), jnp.asarray(jnp.inf), pair, jnp.zeros((n, length)), *room)
+    count, _, _, _, states, actions = lax.while_loop(unsettled, one_more, begun)
+    return Settled(states, actions, count)
 
 
 def _average(

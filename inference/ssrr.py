@@ -23,13 +23,14 @@ from scipy.optimize import isotonic_regression, least_squares
 from ..models.environment import Environment, HostEnvironment, Rollout
 from ..models.networks import DTYPE, ShapedReward
 from ..models.sensing import Recording
-from .adversarial_learner import AdversarialReport, AdversarialState, action_log_likelihood, reported_steps
+from .adversarial_learner import AdversarialReport, AdversarialState, action_log_likelihood
 from .discriminator import Discriminator
 from .noisy_airl import NoisyRollout, NoisyTraining, noisy_airl, roll_out_noisily
 from .ppo import PPO, PPOState
 from .rollouts import begin, finished_returns
 from .session import Learner
 from .snippet_regression import Ranked, Regression, SSRRReward, snippet_regression
+from .truth_sampling import reported_steps
 
 # -- performance against noise ----------------------------------------------------------------------------
 

@@ -13,13 +13,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..models.chain import _bounded_exp, _weigh, filter_forward
 from ..models.demonstration import SEEN, UNKNOWN, Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import occupancy
-from .smoothing import Evidence, gibbs_completions, log_likelihoods
+from .smoothing import Evidence, gibbs_completions, log_likelihoods, settled_completions
 
 
 class Completed(NamedTuple):
@@ -112,19 +112,39 @@ def gibbs_transitions(
     horizon: int,
     draws: int,
     burn_in: int,
+    logits: Float[Array, "S A B"] | None = None,
+    change: ArrayLike = 0.0,
 ) -> Completed:
     """The same estimated from ``draws`` sweeps of the single-site sampler (Eq. 6.10, lines 6-15).
 
-    After the last step the successor is distributed as the dynamics have it.
+    After the last step the successor is distributed as the dynamics have it. With the discriminator's
+    ``logits``, from fewer where their average over sweeps moves by at most ``change`` a step before
+    (:func:`.smoothing.settled_completions`).
     """
-    states, actions = gibbs_completions(key, mdp, log_policy, evidence, draws, burn_in)
-    s, a = jnp.maximum(states, 0), jnp.maximum(actions, 0)
     n, length = evidence.live.shape
     follows = evidence.live & jnp.pad(evidence.live, ((0, 0), (0, 1)))[:, 1:]
-    landed = _landed(mdp.successors, s, a) * mdp.probabilities[s, a]
-    landed = landed / jnp.maximum(jnp.sum(landed, -1, keepdims=True), 1e-300)
-    landed = jnp.where(follows[..., None], landed, mdp.probabilities[s, a])
-    landed = jnp.where(evidence.live[..., None], landed / draws, 0.0)
+
+    def landed_at(states: Array, actions: Array) -> tuple[Array, Array, Array]:
+        s, a = jnp.maximum(states, 0), jnp.maximum(actions, 0)
+        landed = _landed(mdp.successors, s, a) * mdp.probabilities[s, a]
+        landed = landed / jnp.maximum(jnp.sum(landed, -1, keepdims=True), 1e-300)
+        return s, a, jnp.where(follows[..., None], landed, mdp.probabilities[s, a])
+
+    if logits is None:
+        states, actions = gibbs_completions(key, mdp, log_policy, evidence, draws, burn_in)
+        weights = jnp.full(draws, 1 / draws)
+    else:
+        known: Array = logits
+
+        def score(states: Array, actions: Array) -> Array:
+            s, a, landed = landed_at(states, actions)
+            return jnp.sum(landed * known[s, a], -1)
+
+        drawn = settled_completions(key, mdp, log_policy, evidence, draws, burn_in, score, change)
+        states, actions, count = drawn
+        weights = (jnp.arange(draws) < count) / count
+    s, a, landed = landed_at(states, actions)
+    landed = jnp.where(evidence.live[..., None], landed * weights[:, None, None, None], 0.0)
     row, step = jnp.arange(n)[:, None], jnp.arange(length)
     steps = jnp.zeros((n, length, *mdp.successors.shape)).at[row, step, s, a].add(landed)
     starts = _starts(steps, evidence.live, horizon)

@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from i2rl.domains.control import cart_pole
-from i2rl.inference.adversarial_learner import AdversarialTraining, adversarial, reported_steps
+from i2rl.inference.adversarial_learner import AdversarialTraining, adversarial
 from i2rl.inference.discriminator import airl_discriminator, gail_discriminator
 from i2rl.inference.journal import Journal, JournalError
 from i2rl.inference.noisy_airl import NoisyTraining, noisy_airl
@@ -46,17 +46,6 @@ def same(one, other) -> bool:
 
     leaves = zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True)
     return all(bits(a) == bits(b) for a, b in leaves)
-
-
-def test_reported_steps_are_those_with_a_successor_or_a_termination():
-    observations = [np.arange(3.0)[:, None], 10 + np.arange(2.0)[:, None]]
-    rec = recording(observations, [np.array([0, 1, 0]), np.array([1, 1])], terminated=[False, True])
-    steps, live, weights = reported_steps(rec)
-    kept = np.flatnonzero(live)
-    np.testing.assert_array_equal(steps.observations[kept, 0, 0], [0, 1, 10, 11])
-    np.testing.assert_array_equal(steps.successors[kept, 0, 0][:3], [1, 2, 11])
-    np.testing.assert_array_equal(steps.terminated[kept, 0], [False, False, False, True])
-    assert weights.sum() == 1
 
 
 def test_the_same_key_gives_the_same_bits(learner, demonstration):
@@ -106,6 +95,8 @@ def test_reports_are_plain_numbers_of_what_happened(learner, demonstration):
         ({"average": "median"}, "average"),
         ({"learning_rate": float("nan")}, "learning_rate"),
         ({"penalty": -1.0}, "penalty"),
+        ({"change": float("nan")}, "change"),
+        ({"samplings": 0}, "samplings"),
     ],
 )
 def test_training_that_cannot_be_is_refused_by_name(generator, task, wrong, named):

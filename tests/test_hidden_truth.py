@@ -245,6 +245,33 @@ def test_gibbs_sampling_stands_in_for_smoothing(demonstration, reports, sensor, 
     assert drawn < error(reports.observations.reshape(300, 2)[live])
 
 
+def test_a_look_samples_on_until_the_average_logit_settles(generator, truth, sensor, reports):
+    def session(**threshold):
+        learner = robust_airl(generator, truth, sensor, training=TRAINING._replace(**threshold))
+        return learner.update(learner.init(jax.random.key(0)), reports)
+
+    _, once = session()
+    state, strict = session(change=0.002, samplings=12)
+    _, loose = session(change=0.2, samplings=12)
+    assert once.samplings.tolist() == [1, 1]  # of three rounds, the first and the third look
+    assert (strict.samplings > loose.samplings).all()
+    assert (loose.samplings >= 2).all()
+    assert np.isfinite(state.weights).all()
+
+
+def test_sampling_on_leaves_the_chain_and_the_dynamics_alone(task, truth, sensor, reports):
+    hidden, policy = Smoothed(truth, sensor), policy_network(jax.random.key(0), 2, task.actions)
+    begun = hidden.begin(reports, sensor, jax.random.key(1))
+    chain, first = hidden.refresh(begun, sensor, policy, jax.random.key(2))
+    again, further = hidden.more(chain, sensor, policy, jax.random.key(3))
+    assert again is chain
+    same = jax.tree.map(lambda x, y: x.shape == y.shape and x.dtype == y.dtype, first, further)
+    assert all(jax.tree.leaves(same))
+    # Both are of one posterior: on average they differ by what few draws do.
+    gap = jnp.mean(first.steps.observations.mean(1) - further.steps.observations.mean(1), 0)
+    assert (jnp.abs(gap) < 0.03).all()
+
+
 def test_reported_actions_are_cut_to_what_the_generator_can_show(generator, reports):
     # Noise beyond the bounds would tell an expert from a generator whatever they do.
     beyond = reports._replace(actions=5 * jnp.ones_like(reports.actions))

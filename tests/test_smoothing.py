@@ -14,12 +14,14 @@ from hypothesis import strategies as st
 
 from i2rl.inference import smoothing
 from i2rl.inference.smoothing import (
+    Evidence,
     blocked_expectations,
     expectations,
     gibbs_completions,
     gibbs_expectations,
     log_likelihoods,
     sample_completions,
+    settled_completions,
     smooth_all,
 )
 from i2rl.models import Demonstration, ObservationModel, Sensor, Visibility
@@ -220,6 +222,35 @@ def test_gibbs_estimates_lie_within_four_standard_errors_where_every_move_is_pos
         assert (effective > 200).all()
         assert (np.abs(series.mean(0) - true_mean) <= 4 * error).all()
     np.testing.assert_allclose(estimate.counts.reshape(-1), visits.mean(0), atol=1e-9)
+
+
+@pytest.mark.parametrize("change", [0.0, 0.03])
+def test_sweeps_end_once_the_average_of_a_score_settles(random_mdp, change):
+    mdp, draws, burn_in = random_mdp(6, n_successors=3), 200, 5
+    log_policy = jnp.full(mdp.available.shape, -np.log(mdp.n_actions))
+    rng = np.random.default_rng(0)
+    evidence = Evidence(
+        jnp.asarray(rng.normal(size=(3, 7, mdp.n_states, mdp.n_actions))),
+        jnp.arange(7) < jnp.array([7, 4, 6])[:, None],
+    )
+    table = jnp.asarray(rng.normal(size=mdp.available.shape))
+    key = jax.random.key(4)
+    states, actions = gibbs(key, mdp, log_policy, evidence, draws, burn_in)
+    settled = jax.jit(
+        lambda key: settled_completions(
+            key, mdp, log_policy, evidence, draws, burn_in, lambda s, a: table[s, a], change
+        )
+    )(key)
+    count = int(settled.drawn)
+    # What is drawn is drawn as without a threshold.
+    np.testing.assert_array_equal(settled.states[:count], states[:count])
+    np.testing.assert_array_equal(settled.actions[:count], actions[:count])
+    scores = np.asarray(table)[states, actions]
+    averages = np.cumsum(scores, 0) / np.arange(1, draws + 1)[:, None, None]
+    moves = np.abs(np.diff(averages, axis=0))[:, np.asarray(evidence.live)].mean(1)
+    expected = next((i + 2 for i, move in enumerate(moves) if move <= change), draws)
+    assert count == expected
+    assert (count == draws) == (change == 0)
 
 
 def test_gibbs_never_leaves_what_the_policy_may_do(random_mdp):

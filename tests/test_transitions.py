@@ -122,6 +122,20 @@ def test_gibbs_estimates_the_same(random_mdp, sensor, demonstration):
     np.testing.assert_allclose(drawn.steps.sum((2, 3, 4)), evidence.live, atol=1e-9)
 
 
+def test_gibbs_until_the_average_logit_settles_is_gibbs_with_fewer_sweeps(random_mdp, sensor, demonstration):
+    mdp = random_mdp(8, n_successors=4)
+    log_policy = jnp.full(mdp.available.shape, -np.log(mdp.n_actions))
+    evidence = evidence_of(mdp, sensor, demonstration)
+    logits = jnp.asarray(np.random.default_rng(0).normal(size=mdp.successors.shape))
+    key = jax.random.key(0)
+    fixed = gibbs_transitions(key, mdp, log_policy, evidence, HORIZON, 30, 5)
+    never = gibbs_transitions(key, mdp, log_policy, evidence, HORIZON, 30, 5, logits, 0.0)
+    np.testing.assert_allclose(never.steps, fixed.steps, atol=1e-12)
+    early = gibbs_transitions(key, mdp, log_policy, evidence, HORIZON, 30, 5, logits, 0.05)
+    np.testing.assert_allclose(early.steps.sum((2, 3, 4)), evidence.live, atol=1e-9)
+    assert np.abs(np.asarray(early.steps - fixed.steps)).max() > 0.01
+
+
 def test_visits_are_powers_of_the_chain(mdp, log_policy, dense_transitions):
     policy, moves = np.exp(log_policy), dense_transitions(mdp)
     starts = np.random.default_rng(2).random((HORIZON, mdp.n_states))
