@@ -114,21 +114,30 @@ def learner(name: str, method: str, plan: Plan) -> Learner:
             agent, of.truth(draws=_DRAWS), of.assumed, of.fit, discriminator=discriminator, training=training
         )
     # The same steps in all: ranking takes some, and the rest is halved between imitation and the end.
-    ranking = len(_SSRR_LEVELS) * task.horizon / agent.settings.steps
-    half = max(int((plan.rounds - ranking) // 2), 1)
+    sessions = plan.sessions // _gathered(method, plan)
+    ranking = len(_SSRR_LEVELS) * _SSRR_EPISODES * task.horizon / agent.settings.steps
+    half = max(int((plan.sessions * plan.rounds / sessions - ranking) // 2), 1)
     return ssrr(
         agent,
         airl_discriminator(task.observation_size, task.actions, agent.settings.gamma, state_only=True),
         NoisyTraining(half, plan.updates, plan.batch, plan.learning_rate),
-        SSRRTraining(_SSRR_LEVELS, 1, _REGRESSION, rounds=half, start="first"),
+        SSRRTraining(
+            _SSRR_LEVELS, _SSRR_EPISODES, _REGRESSION, rounds=half, average="median", start="first"
+        ),
     )
 
 
 _DRAWS = 4
 _SSRR_LEVELS = tuple(0.05 * i for i in range(16))
+_SSRR_EPISODES, _SSRR_SESSIONS = 3, 2
 _REGRESSION = Regression(
-    hidden=(64, 64), points=32, iterations=200, learning_rate=1e-3, deviation=0.1
+    hidden=(64, 64), points=32, iterations=1000, learning_rate=1e-3, deviation=0.1
 )  # of a session, the networks being carried on
+
+
+def _gathered(method: str, plan: Plan) -> int:
+    """How many sessions' demonstrations are learned from at once: SSRR's ranking needs a long session."""
+    return max(plan.sessions // _SSRR_SESSIONS, 1) if method == SSRR else 1
 
 
 def run(name: str, method: str, seed: int, plan: Plan) -> Outcome:
@@ -139,8 +148,9 @@ def run(name: str, method: str, seed: int, plan: Plan) -> Outcome:
     state = online.init(k_learner)
     rows: list[tuple] = []
     sensors = []
-    for session in range(plan.sessions):
-        truth = _session(of.demonstrations, session, seed, plan)
+    gathered = _gathered(method, plan)
+    for session in range(plan.sessions // gathered):
+        truth = _session(of.demonstrations, session, seed, gathered * plan.trajectories)
         reported = distort(jax.random.fold_in(k_noise, session), of.sensor, truth)
         given: Any = truth if method == CLEAN else reported
         report: Any
@@ -174,11 +184,11 @@ def _sensor_numbers(sensor: Any) -> Float[np.ndarray, " p"]:
     return np.concatenate([np.diag(x) if x.ndim == 2 else np.ravel(x) for x in parts])
 
 
-def _session(whole: Recording, session: int, seed: int, plan: Plan) -> Recording:
+def _session(whole: Recording, session: int, seed: int, trajectories: int) -> Recording:
     """A session's demonstrations: the next of those there are, other ones first for another seed."""
     total = whole.live.shape[0]
     order = np.random.default_rng(seed).permutation(total)
-    places = (session * plan.trajectories + np.arange(plan.trajectories)) % total
+    places = (session * trajectories + np.arange(trajectories)) % total
     return Recording(*(jnp.asarray(x)[order[places]] for x in whole))
 
 
