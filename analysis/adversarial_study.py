@@ -121,9 +121,7 @@ def learner(name: str, method: str, plan: Plan) -> Learner:
         agent,
         airl_discriminator(task.observation_size, task.actions, agent.settings.gamma, state_only=True),
         NoisyTraining(half, plan.updates, plan.batch, plan.learning_rate),
-        SSRRTraining(
-            _SSRR_LEVELS, _SSRR_EPISODES, _REGRESSION, rounds=half, average="median", start="first"
-        ),
+        SSRRTraining(_SSRR_LEVELS, _SSRR_EPISODES, _REGRESSION, rounds=half, average="median", start="first"),
     )
 
 

@@ -20,7 +20,7 @@ import os
 import threading
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import gymnasium
 import jax
@@ -93,6 +93,11 @@ class Locomotion(NamedTuple):
     horizon: int
     terminate_when_unhealthy: bool
     threads: int
+
+    @property
+    def settings(self) -> tuple[tuple[str, Any], ...]:
+        """What tells it from others of its name."""
+        return (("terminate_when_unhealthy", self.terminate_when_unhealthy),)
 
     @property
     def step_seconds(self) -> float:

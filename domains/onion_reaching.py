@@ -166,6 +166,7 @@ def onion_reaching(stride: float = STRIDE, horizon: int = 400) -> Environment:
         step=partial(_step, stride=stride),
         observe=_observe,
         next_state=partial(_next_state, stride=stride),
+        settings=(("stride", stride),),
     )
 
 

@@ -341,6 +341,7 @@ def identity(generator: Any, discriminator: Discriminator) -> dict[str, Any]:
         "discriminator": discriminator.name,
         "networks": dict(discriminator.settings),
         "horizon": generator.environment.horizon,
+        "environment": dict(getattr(generator.environment, "settings", ())),
         "agent": generator.settings._asdict(),
     }
 

@@ -7,7 +7,7 @@ Two kinds. An :class:`Environment` is pure JAX functions, so that a whole rollou
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import jax
 import numpy as np
@@ -31,6 +31,7 @@ class Environment(NamedTuple):
     observe : ``(state) -> observation [d]``, 32-bit floats
     next_state : ``(observation [..., d], action) -> observation [..., d]``, the dynamics alone, in the
         coordinates of an observation and in the precision they are given in
+    settings : pairs that tell it from others of its name, for a journal
     """
 
     name: str
@@ -43,10 +44,14 @@ class Environment(NamedTuple):
     step: Callable[[Array, Array], tuple[Array, Array, Array]]
     observe: Callable[[Array], Array]
     next_state: Callable[[Array, Array], Array]
+    settings: tuple[tuple[str, Any], ...] = ()
 
 
 class HostEnvironment(Protocol):
-    """A task stepped in NumPy, many episodes at a time. Actions beyond the bounds are cut to them."""
+    """A task stepped in NumPy, many episodes at a time. Actions beyond the bounds are cut to them.
+
+    It may have ``settings`` as an :class:`Environment` does.
+    """
 
     @property
     def name(self) -> str:

@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 
 from i2rl.domains.control import cart_pole
-from i2rl.inference.adversarial_learner import AdversarialTraining, adversarial
+from i2rl.domains.onion_reaching import onion_reaching
+from i2rl.inference.adversarial_learner import AdversarialTraining, adversarial, airl
 from i2rl.inference.discriminator import airl_discriminator, gail_discriminator
 from i2rl.inference.journal import Journal, JournalError
 from i2rl.inference.noisy_airl import NoisyTraining, noisy_airl
@@ -149,6 +150,15 @@ def test_a_journal_refuses_another_discriminator(learner, generator, task, tmp_p
         Journal.open(tmp_path / "run.journal", other)
     with Journal.open(tmp_path / "run.journal", learner) as journal:
         assert journal.session == 0
+
+
+def test_a_journal_refuses_another_setting_of_the_task(tmp_path):
+    def learner(stride: float):
+        return airl(ppo(onion_reaching(stride), n_envs=2, n_steps=8, minibatch=8), training=SMALL)
+
+    Journal.open(tmp_path / "run.journal", learner(0.3)).close()
+    with pytest.raises(JournalError, match="environment"):
+        Journal.open(tmp_path / "run.journal", learner(0.2))
 
 
 @pytest.mark.parametrize("kind", [airl_discriminator, gail_discriminator])
