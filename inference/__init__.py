@@ -49,6 +49,9 @@ _HOMES = {
     "hidden_truth": (
         "Smoothed",
         "SmoothedAndFitted",
+        "fit_gaussian",
+        "fit_isotropic",
+        "fit_shift",
         "robust_airl",
         "robust_airl_with_sensor",
     ),

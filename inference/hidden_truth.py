@@ -127,6 +127,17 @@ def fit_gaussian(truth: GaussianTruth, chain: Any, policy: Policy, sensor: Gauss
     return fitted_sensor(chain.reported, truth.posterior(chain, policy, sensor))
 
 
+def fit_isotropic(truth: GaussianTruth, chain: Any, policy: Policy, sensor: GaussianSensor) -> GaussianSensor:
+    """One covariance for all components of states and actions alike (closed form).
+
+    What the dynamics say little of, such as the velocities of limbs that strike the ground, could not be told
+    from noise by itself: :func:`fit_gaussian` leaves such components as they were believed to be.
+    """
+    each = fit_gaussian(truth, chain, policy, sensor)
+    common = jnp.mean(jnp.concatenate([jnp.diagonal(x) for x in each]))
+    return GaussianSensor(*(common * jnp.eye(len(x)) for x in each))
+
+
 def fit_shift(truth: CandidateTruth, chain: Any, policy: Policy, sensor: ShiftSensor) -> ShiftSensor:
     """The probability of a shift (closed form)."""
     return fitted_shift_sensor(sensor, chain, truth.posterior(chain, policy, sensor))

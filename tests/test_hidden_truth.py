@@ -6,7 +6,14 @@ import pytest
 from i2rl.inference.adversarial_learner import AdversarialTraining, airl
 from i2rl.inference.gaussian_gibbs import GaussianGibbs
 from i2rl.inference.gaussian_truth import gaussian_truth, jax_dynamics
-from i2rl.inference.hidden_truth import Smoothed, as_expert, robust_airl, robust_airl_with_sensor
+from i2rl.inference.hidden_truth import (
+    Smoothed,
+    as_expert,
+    fit_gaussian,
+    fit_isotropic,
+    robust_airl,
+    robust_airl_with_sensor,
+)
 from i2rl.inference.journal import Journal, JournalError
 from i2rl.inference.ppo import ppo
 from i2rl.inference.session import run_sessions
@@ -227,6 +234,18 @@ def test_a_journal_refuses_another_sensor(generator, truth, sensor, tmp_path):
 def test_the_default_discriminator_has_the_generators_discount(task, truth, sensor):
     agent = ppo(task, n_envs=4, n_steps=32, gamma=0.9)
     assert robust_airl(agent, truth, sensor).configuration["networks"]["discount"] == 0.9
+
+
+def test_one_covariance_for_all_is_the_mean_of_one_for_each(task, truth, sensor, reports):
+    hidden, policy = Smoothed(truth, sensor), policy_network(jax.random.key(0), 2, task.actions)
+    chain, _ = hidden.refresh(
+        hidden.begin(reports, sensor, jax.random.key(1)), sensor, policy, jax.random.key(2)
+    )
+    each = fit_gaussian(truth, chain.chain, policy, sensor)
+    common = fit_isotropic(truth, chain.chain, policy, sensor)
+    expected = np.concatenate([np.diag(x) for x in each]).mean()
+    np.testing.assert_allclose(common.state_covariance, expected * np.eye(2))
+    np.testing.assert_allclose(common.action_covariance, expected * np.eye(1))
 
 
 def test_gibbs_sampling_stands_in_for_smoothing(demonstration, reports, sensor, truth, task):
