@@ -254,7 +254,7 @@ def _onion(plan: Plan) -> Case:
             gaussian_truth,
             jax_dynamics(environment.next_state),
             environment.observation_size,
-            process_covariance=plan.process,
+            process_covariance=np.asarray(plan.process),
         ),
         fit_isotropic,
         partial(_on_experts_states, environment, expert, 200),
