@@ -35,8 +35,8 @@ class Plan(NamedTuple):
     trajectories : int, demonstrated in a session
     covariance : float, of a Gaussian sensor, for states and actions
     shift, probability : float, of mountain car's sensor
-    process : ``Q``, how far the truth is let stray from the dynamics: a number, or one of a robot's positions
-        and one of its velocities
+    process : ``Q``, how far the truth is let stray from the dynamics: a number, or one for a robot's positions
+        and one for its velocities (for the onions' arm, and for what lies on the belt)
     updates, batch : int, of the discriminator in a round
     learning_rate, penalty : float, of the discriminator, and of its gradient
     episodes : int, judged after every session
@@ -139,7 +139,8 @@ PLANS = {
         episodes=40,
         settings=(("n_envs", 20), ("n_steps", 128), ("learning_rate", 1e-3), ("scale_rewards", True)),
     ),
-    "onion": Plan(covariance=0.01, trajectories=4),
+    # What is grasped, dropped or put into the bin jumps.
+    "onion": Plan(covariance=0.01, trajectories=4, process=(1e-4, 0.1)),
 }
 
 
@@ -158,7 +159,6 @@ def _robot(name: str, plan: Plan) -> Case:
     stored, expert = load_demonstrations(name), load_expert(name)
     limit = np.full(robot.observation_size, np.inf)
     positions = (robot.observation_size + 1) // 2 - 1
-    process = np.broadcast_to(plan.process, (2,)).repeat([positions, robot.observation_size - positions])
     if name != "half-cheetah":  # Gymnasium shows velocities of the others up to 10 only
         limit[positions:] = 10.0
     return Case(
@@ -173,7 +173,7 @@ def _robot(name: str, plan: Plan) -> Case:
             gaussian_truth,
             robot,
             robot.observation_size,
-            process_covariance=process,
+            process_covariance=_each(plan.process, positions, robot.observation_size),
             observation_bounds=(-limit, limit),
             action_bounds=(np.array(robot.actions.low), np.array(robot.actions.high)),
         ),
@@ -192,6 +192,11 @@ def _gaussian(environment: Any, plan: Plan) -> tuple[GaussianSensor, GaussianSen
     known = GaussianSensor(plan.covariance, plan.covariance).sized(*sizes)
     assumed = GaussianSensor(_ASSUMED * plan.covariance, _ASSUMED * plan.covariance).sized(*sizes)
     return known, assumed, f"normal, covariance {plan.covariance:g} of every state and action"
+
+
+def _each(process: float | tuple[float, float], first: int, size: int) -> np.ndarray:
+    """A diagonal: one number for the first components, one for the rest."""
+    return np.broadcast_to(process, (2,)).repeat([first, size - first])
 
 
 def _on_experts_states(environment: Any, expert: Any, length: int, policy: Any, key: Array) -> float:
@@ -254,7 +259,7 @@ def _onion(plan: Plan) -> Case:
             gaussian_truth,
             jax_dynamics(environment.next_state),
             environment.observation_size,
-            process_covariance=np.asarray(plan.process),
+            process_covariance=_each(plan.process, 9, environment.observation_size),
         ),
         fit_isotropic,
         partial(_on_experts_states, environment, expert, 200),
