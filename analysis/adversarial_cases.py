@@ -35,8 +35,8 @@ class Plan(NamedTuple):
     trajectories : int, demonstrated in a session
     covariance : float, of a Gaussian sensor, for states and actions
     shift, probability : float, of mountain car's sensor
-    process : ``Q``, how far the truth is let stray from the dynamics: a number, or one for a robot's positions
-        and one for its velocities (for the onions' arm, and for what lies on the belt)
+    process : ``Q``, how far the truth is let stray from the dynamics: a number, or one for a robot's
+        positions and one for its velocities (for the onions' arm, and for what lies on the belt)
     updates, batch : int, of the discriminator in a round
     learning_rate, penalty : float, of the discriminator, and of its gradient
     episodes : int, judged after every session
