@@ -102,7 +102,7 @@ def recovery_table(results: AdversarialResults) -> Table:
         if results.domain in TABLE_7_3:
             table = TABLE_7_3[results.domain]
             printed = 1 - table[NOISY] / table[CLEAN]
-        lost = f"{1 - noisy.mean() / clean.mean():.0%}"
+        lost = f"{round(1 - noisy.mean() / clean.mean(), 2) + 0.0:.0%}"  # nothing is not less than nothing
         rows.append((f"{measure} lost to noise", lost, _NONE if printed is None else f"{printed:.0%}"))
         robust = results.late(ROBUST, results.measure)
         if robust is not None:
@@ -140,8 +140,8 @@ def correlation_table(results: AdversarialResults) -> Table:
         "Learned against true reward on held-out episodes of a mix of policies, from the expert's to a "
         "uniform one; trajectories by their sums, over equally long episodes unless the task itself ends "
         "them. Mean over seeds and Student's 95 % interval (of one seed: drawing whole trajectories with "
-        "replacement). The dissertation's (Table 7.4, Pearson) come with p-values that fit 4 to 7 points "
-        "each.",
+        "replacement); none where a reward is the same in all steps. The dissertation's (Table 7.4, Pearson) "
+        "come with p-values that fit 4 to 7 points each.",
     )  # fmt: skip
 
 
@@ -224,6 +224,8 @@ def _with_interval(
 
 
 def _correlated(found: Sequence[Correlation]) -> tuple[str, str]:
+    if np.isnan([c.pearson for c in found]).any():
+        return _NONE, _NONE
     if len(found) > 1:
         pearson, spearman = ([getattr(c, of) for c in found] for of in ("pearson", "spearman"))
         return _with_interval(np.array(pearson), 1, 2), _with_interval(np.array(spearman), 1, 2)

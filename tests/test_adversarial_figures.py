@@ -275,6 +275,22 @@ def test_correlations_are_told_beside_table_7_4(hopper):
     assert f"({ends.low:.2f} to {ends.high:.2f})" in correlation_table(one).rows[0][3]
 
 
+def test_a_reward_that_never_changes_is_correlated_with_nothing(hopper):
+    learned = np.random.default_rng(0).normal(size=(8, 30))
+    same = reward_scatter(
+        learned, np.full((8, 30), -1.0), np.ones((8, 30), bool), np.arange(8) // 4, jax.random.key(0)
+    )
+    shown = hopper._replace(methods={CLEAN: hopper.methods[CLEAN]._replace(correlations=(same.correlation,))})
+    assert correlation_table(shown).rows[0][3:5] == ("-", "-")
+
+
+def test_a_loss_of_nothing_has_no_sign(hopper):
+    slightly_better = {
+        m: MethodResult(PAIRS, returns=np.full((5, 8), x)) for m, x in ((CLEAN, 2000.0), (NOISY, 2001.0))
+    }
+    assert recovery_table(hopper._replace(methods=slightly_better)).rows[0][1] == "0%"
+
+
 def test_a_trajectory_of_pairs_has_its_section(patrol, tmp_path, random_mdp):
     mdp = random_mdp(0)
     drawn = Demonstration.from_pairs(np.array([[0, 1, 2, 3, 0, 1]]), np.array([[0, 1, 2, 0, 1, 2]]))
