@@ -83,10 +83,14 @@ def learning_table(results: AdversarialResults) -> Table:
             row.append(f"{printed[row[0]]:,}" if row[0] in printed else _NONE)
     sessions = max((len(r.pairs) for r in results.methods.values()), default=0)
     kept = max(sessions // 4, 1)
+    fewer = [name for name, r in results.methods.items() if len(r.pairs) < sessions]
     return Table(
         headings,
         rows,
         f"Mean of the last {kept} of {sessions} sessions (95 % interval over seeds)."
+        + "".join(
+            f" {name} learned from as much in {len(results.methods[name].pairs)} sessions." for name in fewer
+        )
         + (f" LBA over {results.accuracy_over}." if "accuracy" in measures else "")
         + (" The dissertation's returns are of Table 7.3." if printed is not None else ""),
     )
@@ -228,7 +232,7 @@ def _correlated(found: Sequence[Correlation]) -> tuple[str, str]:
         return _NONE, _NONE
     if len(found) > 1:
         pearson, spearman = ([getattr(c, of) for c in found] for of in ("pearson", "spearman"))
-        return _with_interval(np.array(pearson), 1, 2), _with_interval(np.array(spearman), 1, 2)
+        return tuple(_with_interval(np.array(r), 1, 2, (-1, 1)) for r in (pearson, spearman))  # type: ignore[return-value]
     one = found[0]
     pairs = ((one.pearson, one.bootstrap), (one.spearman, one.spearman_bootstrap))
     of_values, of_ranks = (f"{r:.2f} ({ends.low:.2f} to {ends.high:.2f})" for r, ends in pairs)

@@ -284,6 +284,15 @@ def test_a_reward_that_never_changes_is_correlated_with_nothing(hopper):
     assert correlation_table(shown).rows[0][3:5] == ("-", "-")
 
 
+def test_intervals_of_correlations_end_at_one(hopper):
+    ends = [
+        x._replace(steps=x.steps._replace(pearson=r))
+        for x, r in zip((hopper.scatters[CLEAN].correlation,) * 2, (0.9, -0.3), strict=True)
+    ]
+    shown = hopper._replace(methods={CLEAN: hopper.methods[CLEAN]._replace(correlations=tuple(ends))})
+    assert correlation_table(shown).rows[0][3] == "0.30 (-1.00 to 1.00)"
+
+
 def test_a_loss_of_nothing_has_no_sign(hopper):
     slightly_better = {
         m: MethodResult(PAIRS, returns=np.full((5, 8), x)) for m, x in ((CLEAN, 2000.0), (NOISY, 2001.0))
