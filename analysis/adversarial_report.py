@@ -241,7 +241,8 @@ def _correlated(found: Sequence[Correlation]) -> tuple[str, str]:
 
 def _recovered(found: Recovery) -> str:
     if found.lost < 1 and not (math.isfinite(found.low) and math.isfinite(found.high)):
-        return f"not known: noise cost something in {found.lost:.0%} of resamples only"
+        told = "not known" if found.lost < 0.5 else f"{found.share:.0%}, interval not known"
+        return f"{told}: noise cost something in {found.lost:.0%} of resamples only"
     return f"{found.share:.0%} ({found.low:.0%} to {found.high:.0%})"
 
 
