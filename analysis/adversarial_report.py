@@ -231,8 +231,11 @@ def _correlated(found: Sequence[Correlation]) -> tuple[str, str]:
     if np.isnan([c.pearson for c in found]).any():
         return _NONE, _NONE
     if len(found) > 1:
-        pearson, spearman = ([getattr(c, of) for c in found] for of in ("pearson", "spearman"))
-        return tuple(_with_interval(np.array(r), 1, 2, (-1, 1)) for r in (pearson, spearman))  # type: ignore[return-value]
+        of_values, of_ranks = (
+            _with_interval(np.array([getattr(c, of) for c in found]), 1, 2, (-1, 1))
+            for of in ("pearson", "spearman")
+        )
+        return of_values, of_ranks
     one = found[0]
     pairs = ((one.pearson, one.bootstrap), (one.spearman, one.spearman_bootstrap))
     of_values, of_ranks = (f"{r:.2f} ({ends.low:.2f} to {ends.high:.2f})" for r, ends in pairs)

@@ -135,7 +135,8 @@ _REGRESSION = Regression(
 
 def _gathered(method: str, plan: Plan) -> int:
     """How many sessions' demonstrations are learned from at once: SSRR's ranking needs a long session."""
-    return max(plan.sessions // _SSRR_SESSIONS, 1) if method == SSRR else 1
+    halved = method == SSRR and plan.sessions % _SSRR_SESSIONS == 0
+    return plan.sessions // _SSRR_SESSIONS if halved else 1
 
 
 def run(name: str, method: str, seed: int, plan: Plan) -> Outcome:

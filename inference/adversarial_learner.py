@@ -39,7 +39,7 @@ from .discriminator import (
 from .discriminator_training import Objective, discriminator_updates
 from .rollouts import finished_returns
 from .session import Learner
-from .truth_sampling import FaceValue, Truth, look, within_bounds
+from .truth_sampling import FaceValue, Truth, look
 
 if TYPE_CHECKING:
     import equinox as eqx
@@ -221,8 +221,7 @@ def adversarial(
 
     @jax.jit
     def logits_of(network: ShapedReward, policy: Policy, steps: Transitions) -> Float[Array, "N M"]:
-        cut = steps._replace(actions=task.actions.clip(steps.actions))
-        return discriminator.logits(network, policy, cut)
+        return discriminator.logits(network, policy, steps)
 
     def init(key: Array) -> AdversarialState:
         k_network, k_generator, k_rest = jax.random.split(key, 3)
@@ -250,9 +249,8 @@ def adversarial(
             if expert is None or r % how.refresh == 0:
                 logits = partial(logits_of, network, policy)
                 chain, expert, made = look(
-                    truth, chain, sensor, policy, k_truth, logits, how.change, how.samplings
+                    truth, chain, sensor, policy, k_truth, task.actions, logits, how.change, how.samplings
                 )
-                expert = within_bounds(task.actions, expert)
                 samplings.append(made)
             before = acting.running
             acting, rollout = generator.collect(acting)

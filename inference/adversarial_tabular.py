@@ -120,8 +120,8 @@ def gibbs_airl_tabular(
     """robust-AIRL as Algorithm 3 has it: ``draws`` sweeps of the single-site sampler in every round.
 
     Fewer, where the average logit of a step moves by at most ``change`` with one more (the mean over steps of
-    its absolute change). The dissertation's ``delta_G`` is the sum over a batch and as many generated steps:
-    its .1 with 1,024 steps is a ``change`` of 1e-4 here.
+    its absolute change); with 0 always so many. The dissertation's ``delta_G`` is the sum over a batch and as
+    many generated steps: its .1 with 1,024 steps is a ``change`` of 1e-4 here.
     """
     if draws < 1 or burn_in < 0:
         raise ValueError(f"a sampler needs at least one draw and no negative burn-in, got {draws}, {burn_in}")

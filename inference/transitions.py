@@ -118,7 +118,7 @@ def gibbs_transitions(
     """The same estimated from ``draws`` sweeps of the single-site sampler (Eq. 6.10, lines 6-15).
 
     After the last step the successor is distributed as the dynamics have it. With the discriminator's
-    ``logits``, from fewer where their average over sweeps moves by at most ``change`` a step before
+    ``logits``, from no more sweeps than their average takes to move by at most ``change``
     (:func:`.smoothing.settled_completions`).
     """
     n, length = evidence.live.shape
@@ -140,8 +140,9 @@ def gibbs_transitions(
             s, a, landed = landed_at(states, actions)
             return jnp.sum(landed * known[s, a], -1)
 
-        drawn = settled_completions(key, mdp, log_policy, evidence, draws, burn_in, score, change)
-        states, actions, count = drawn
+        states, actions, count = settled_completions(
+            key, mdp, log_policy, evidence, draws, burn_in, score, change
+        )
         weights = (jnp.arange(draws) < count) / count
     s, a, landed = landed_at(states, actions)
     landed = jnp.where(evidence.live[..., None], landed * weights[:, None, None, None], 0.0)

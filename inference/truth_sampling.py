@@ -86,6 +86,7 @@ def look(
     sensor: Any,
     policy: Policy,
     key: Array,
+    actions: ActionSpace,
     logits: Callable[[Transitions], Float[Array, "N M"]],
     change: float = np.inf,
     most: int = 20,
@@ -95,14 +96,16 @@ def look(
     A move is the mean over steps of the absolute change of the average with one more sampling. (Algorithm 3
     as printed compares an average with itself; as released, it sums over a batch and as many generated steps,
     so that what it means depends on the batch.) Whatever is made, samples have the one shape, for which is
-    compiled: those that were not drawn weigh nothing.
+    compiled: those that were not drawn weigh nothing. Actions are those of :func:`within_bounds`.
     """
     chain, first = truth.refresh(chain, sensor, policy, key)
+    first = within_bounds(actions, first)
     if np.isinf(change):
         return Sampled(chain, first, 1)
     drawn, average = [first], _mean(first, logits(first.steps))
     while len(drawn) < most:
         chain, further = truth.more(chain, sensor, policy, jax.random.fold_in(key, len(drawn)))
+        further = within_bounds(actions, further)
         drawn.append(further)
         step = (_mean(further, logits(further.steps)) - average) / len(drawn)
         average += step
