@@ -15,6 +15,9 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy import sparse
 
+from .probabilities import normalised, sum_tolerance
+from .text import listed, shortened
+
 # Gathering from predecessors beats scattering to successors on a CPU while no state has far more
 # predecessors than the average; past this ratio (an absorbing sink, say) the padding costs more.
 _MAX_INFLOW_RATIO = 6
@@ -115,14 +118,17 @@ class TabularMDP:
     ) -> TabularMDP:
         """Build an MDP from successor lists ``[S, A, B]``.
 
-        ``initial`` defaults to uniform, ``available`` to every pair. Raises ``ValueError`` that names the
-        state, action or feature at fault: probabilities that are negative, NaN or do not sum to one,
-        successors that are no states, features of the wrong shape or not finite, a discount outside
-        (0, 1], a state with no available action, names of the wrong number or repeated.
+        ``initial`` defaults to uniform, ``available`` to every pair. Probabilities may sum to one within the
+        precision of their type (:func:`~i2rl.models.probabilities.sum_tolerance`). Those of ``initial``, and
+        those of transitions shorter than 64 bits, are then divided by their sum; what sums to one within
+        64-bit rounding keeps its bits. Raises ``ValueError`` that names the state, action or feature at
+        fault: probabilities that are negative, NaN or do not sum to one, successors that are no states,
+        features of the wrong shape or not finite, a discount outside (0, 1], a state with no available
+        action, names of the wrong number or repeated.
         """
         successors = np.asarray(successors)
-        probabilities = np.asarray(probabilities, dtype=float)
-        features = np.asarray(features, dtype=float)
+        given = np.asarray(probabilities)
+        probabilities, features = _real("probabilities", given), _real("features", features)
         if successors.ndim != 3 or successors.shape != probabilities.shape:
             raise ValueError(
                 "successors and probabilities must have one shape [S, A, B], got "
@@ -157,19 +163,24 @@ class TabularMDP:
             raise ValueError(
                 f"feature {name.feature(k)} of {name.pair(s, a)} is {features[s, a, k]}, not a number"
             )
-        _check_transitions(successors, probabilities, available, n_states, name)
+        tolerance = sum_tolerance(given.dtype, given.shape[-1])
+        _check_transitions(successors, probabilities, available, n_states, name, tolerance)
         if not 0 < discount <= 1:
             raise ValueError(f"discount must lie in (0, 1], got {discount}")
-        initial = np.full(n_states, 1 / n_states) if initial is None else np.asarray(initial, dtype=float)
+        start = np.full(n_states, 1 / n_states) if initial is None else np.asarray(initial)
+        initial = _real("initial", start)
         if initial.shape != (n_states,):
             raise ValueError(f"initial must have shape [{n_states}], got {initial.shape}")
-        if not np.isfinite(initial).all() or (initial < 0).any() or abs(initial.sum() - 1) > 1e-8:
+        within = sum_tolerance(start.dtype, n_states)
+        if not np.isfinite(initial).all() or (initial < 0).any() or abs(initial.sum() - 1) > within:
             raise ValueError(
                 f"initial must be a distribution over states: its least value is {initial.min()}, "
                 f"its sum {initial.sum()}"
             )
         # Unavailable pairs lead nowhere: they keep their place with zero probability and zero features.
         probabilities = np.where(available[..., None], probabilities, 0.0)
+        if tolerance > sum_tolerance(float, 1):  # they were given in fewer than 64 bits
+            probabilities = normalised(probabilities)
         features = np.where(available[..., None], features, 0.0)
         successors = np.where(probabilities > 0, successors, np.arange(n_states)[:, None, None]).astype(
             np.int32
@@ -179,7 +190,7 @@ class TabularMDP:
             successors=jnp.asarray(successors),
             probabilities=jnp.asarray(probabilities),
             features=jnp.asarray(features),
-            initial=jnp.asarray(initial / initial.sum()),
+            initial=jnp.asarray(normalised(initial)),
             discount=jnp.asarray(float(discount)),
             available=jnp.asarray(available),
             inflow_pairs=None if inflow is None else jnp.asarray(inflow[0]),
@@ -190,12 +201,12 @@ class TabularMDP:
     @staticmethod
     def from_dense(transitions: np.ndarray, features: np.ndarray, **options: Any) -> TabularMDP:
         """Build an MDP from dense transitions ``[S, A, S]``; options as for :meth:`from_successors`."""
-        transitions = np.asarray(transitions, dtype=float)
+        transitions = np.asarray(transitions)
         if transitions.ndim != 3 or transitions.shape[0] != transitions.shape[2]:
             raise ValueError(f"dense transitions must have shape [S, A, S], got {transitions.shape}")
         n_states, n_actions, _ = transitions.shape
-        rows = sparse.csr_array(transitions.reshape(n_states * n_actions, n_states))
-        return TabularMDP.from_sparse(rows, features, **options)
+        rows = sparse.csr_array(transitions.reshape(n_states * n_actions, n_states).astype(float))
+        return _from_rows(rows, transitions.dtype, features, **options)
 
     @staticmethod
     def from_sparse(
@@ -223,23 +234,7 @@ class TabularMDP:
             n_states = rows.shape[1]
             if n_states == 0 or rows.shape[0] % n_states:
                 raise ValueError(f"transitions must have shape [S * A, S], got {rows.shape}")
-            n_actions = rows.shape[0] // n_states
-        rows.sum_duplicates()
-        counts = np.diff(rows.indptr)
-        width = max(int(counts.max(initial=0)), 1)
-        slot = np.arange(rows.nnz) - np.repeat(rows.indptr[:-1], counts)
-        pair = np.repeat(np.arange(len(counts)), counts)
-        successors = np.repeat(np.repeat(np.arange(n_states), n_actions)[:, None], width, axis=1)
-        probabilities = np.zeros((len(counts), width))
-        successors[pair, slot] = rows.indices
-        probabilities[pair, slot] = rows.data
-        shape = (n_states, n_actions, width)
-        return TabularMDP.from_successors(
-            successors.reshape(shape),
-            probabilities.reshape(shape),
-            features,
-            **options,
-        )
+        return _from_rows(rows, rows.dtype, features, **options)
 
     # -- shape and names ------------------------------------------------------------------------------
 
@@ -274,10 +269,16 @@ class TabularMDP:
         return self.labels.features or tuple(f"f{i}" for i in range(self.n_features))
 
     def fingerprint(self) -> str:
-        """Hexadecimal digest of everything that defines this MDP; equal exactly for equal MDPs."""
+        """Digest everything that defines this MDP, in hexadecimal; equal exactly for equal MDPs.
+
+        The start enters divided by its sum, as MDPs once kept it: journals remember these digests.
+        """
+        initial = np.asarray(self.initial)
+        if sum_tolerance(initial.dtype, initial.size) >= abs(initial.sum() - 1):
+            initial = initial / initial.sum()
         digest = hashlib.sha256()
         for leaf in (
-            self.successors, self.probabilities, self.features, self.initial, self.discount, self.available,
+            self.successors, self.probabilities, self.features, initial, self.discount, self.available,
         ):  # fmt: skip
             array = np.ascontiguousarray(leaf)
             digest.update(f"{array.dtype}{array.shape}".encode())
@@ -320,6 +321,36 @@ class TabularMDP:
         return jnp.zeros((self.n_states, self.n_states)).at[rows, self.successors].add(flow)
 
 
+def _real(name: str, given: Any) -> Float[np.ndarray, "..."]:
+    """The numbers as 64-bit floats."""
+    array = np.asarray(given)
+    if array.dtype.kind == "c":
+        raise ValueError(f"{name} must be real numbers; got {array.dtype}")
+    return array.astype(float, copy=False)
+
+
+def _from_rows(rows: sparse.csr_array, dtype: np.dtype, features: np.ndarray, **options: Any) -> TabularMDP:
+    """The MDP of a row of ``[S * A, S]`` for each pair, whose probabilities were given in ``dtype``."""
+    rows.sum_duplicates()
+    counts = np.diff(rows.indptr)
+    width = max(int(counts.max(initial=0)), 1)
+    slot = np.arange(rows.nnz) - np.repeat(rows.indptr[:-1], counts)
+    pair = np.repeat(np.arange(len(counts)), counts)
+    n_states = rows.shape[1]
+    n_actions = rows.shape[0] // n_states
+    successors = np.repeat(np.repeat(np.arange(n_states), n_actions)[:, None], width, axis=1)
+    probabilities = np.zeros((len(counts), width))
+    successors[pair, slot] = rows.indices
+    probabilities[pair, slot] = rows.data
+    shape = (n_states, n_actions, width)
+    return TabularMDP.from_successors(
+        successors.reshape(shape),
+        probabilities.reshape(shape).astype(dtype),
+        features,
+        **options,
+    )
+
+
 @dataclass(frozen=True)
 class _PairNames:
     """Names for error messages, looked up one at a time (a million states need no million names)."""
@@ -327,13 +358,13 @@ class _PairNames:
     labels: Labels
 
     def state(self, s: int) -> str:
-        return f"{self.labels.states[s]!r} ({s})" if self.labels.states else f"{int(s)}"
+        return f"{shortened(self.labels.states[s])} ({s})" if self.labels.states else f"{int(s)}"
 
     def action(self, a: int) -> str:
-        return f"{self.labels.actions[a]!r} ({a})" if self.labels.actions else f"{int(a)}"
+        return f"{shortened(self.labels.actions[a])} ({a})" if self.labels.actions else f"{int(a)}"
 
     def feature(self, k: int) -> str:
-        return f"{self.labels.features[k]!r} ({k})" if self.labels.features else f"{int(k)}"
+        return f"{shortened(self.labels.features[k])} ({k})" if self.labels.features else f"{int(k)}"
 
     def pair(self, s: int, a: int) -> str:
         return f"state {self.state(s)}, action {self.action(a)}"
@@ -362,13 +393,18 @@ def _checked_labels(
         if len(names) != sizes[kind]:
             raise ValueError(f"{len(names)} {kind} names were given for {sizes[kind]} {kind}s")
         if len(set(names)) != len(names):
-            repeated = [name for name, count in Counter(names).items() if count > 1][:3]
-            raise ValueError(f"{kind} names must differ; repeated: {', '.join(repeated)}")
+            repeated = [name for name, count in Counter(names).items() if count > 1]
+            raise ValueError(f"{kind} names must differ; repeated: {listed(repeated)}")
     return Labels(*given.values())
 
 
 def _check_transitions(
-    successors: np.ndarray, probabilities: np.ndarray, available: np.ndarray, n_states: int, name: _PairNames
+    successors: np.ndarray,
+    probabilities: np.ndarray,
+    available: np.ndarray,
+    n_states: int,
+    name: _PairNames,
+    tolerance: float,
 ) -> None:
     mask = available[..., None]
     probabilities = np.where(mask, probabilities, 0.0)
@@ -381,7 +417,7 @@ def _check_transitions(
             f"a transition probability of {name.pair(s, a)} is negative: {probabilities[s, a, b]}"
         )
     total = probabilities.sum(-1)
-    wrong = available & (np.abs(total - 1) > 1e-8)
+    wrong = available & (np.abs(total - 1) > tolerance)
     if wrong.any():
         s, a = np.argwhere(wrong)[0]
         raise ValueError(
