@@ -51,8 +51,8 @@ class JSONError(ValueError):
 def parsed_json(text: str) -> Any:
     """Parse JSON text. Raises :class:`JSONError` for whatever is not JSON, or not plainly so.
 
-    Refused are, beside errors of syntax, nesting deeper than Python's stack, integers of more digits
-    than Python converts (4,300) and objects that have a field twice. ``NaN`` and ``Infinity`` are read as floats.
+    Refused are, beside errors of syntax, nesting deeper than Python's stack, integers of more digits than
+    Python converts (4,300), and objects that have a field twice. ``NaN`` and ``Infinity`` are read as floats.
     """
     try:
         return json.loads(text, object_pairs_hook=_distinct)
