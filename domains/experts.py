@@ -26,13 +26,17 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..inference.ppo import PPO, Training, ppo
 from ..inference.rollouts import Task, play
+from ..models.archives import StorageError, read_arrays
 from ..models.networks import Policy, policy_network
 from ..models.sensing import Recording, recording
+from ..models.text import parsed_json, shortened
 from .control import mountain_car
 from .locomotion import ROBOTS, locomotion
 
 EXPERTS = (*ROBOTS, "mountain-car")
 FOLDER = Path(str(files(__package__))) / "recordings"
+
+_EPISODES = {"observations": "f", "actions": "fiu", "rewards": "f", "lengths": "iu", "terminated": "b"}
 
 TARGETS = {"hopper": 2810.0, "walker2d": 2700.0, "half-cheetah": 2507.0, "mountain-car": -110.0}
 """Returns to reach: the dissertation's experts' (Table 7.3), and Gymnasium's for a solved mountain car."""
@@ -159,27 +163,56 @@ def demonstrate_expert(task: Task, policy: Policy, key: Array, n: int) -> Demons
 
 
 def load_demonstrations(name: str) -> Demonstrations:
-    """The stored episodes of an expert. Raises ``ValueError`` for a name that is not in :data:`EXPERTS`."""
-    with np.load(FOLDER / f"{_known(name)}-demonstrations.npz", allow_pickle=False) as arrays:
-        return Demonstrations(**arrays)
+    """Load the stored episodes of an expert.
+
+    Raises ``ValueError`` for a name that is not in :data:`EXPERTS`, and :class:`StorageError` (a
+    ``ValueError``) naming a file that holds something else.
+    """
+    path = FOLDER / f"{_known(name)}-demonstrations.npz"
+    arrays = read_arrays(path, _EPISODES, required=tuple(_EPISODES), what="archive of demonstrations")
+    episodes = Demonstrations(**arrays)
+    rows = episodes.rewards.shape
+    for field, array, rank in zip(_EPISODES, episodes, (3, (2, 3), 2, 1, 1), strict=True):
+        if array.ndim not in np.atleast_1d(rank) or array.shape[:2] != rows[: array.ndim]:
+            raise StorageError(
+                f"{path}: the array {field!r} of shape {array.shape} does not fit rewards [n, L] of {rows}"
+            )
+    if not ((episodes.lengths >= 0) & (episodes.lengths <= rows[1])).all():
+        raise StorageError(f"{path}: the array 'lengths' must lie between 0 and {rows[1]}")
+    return episodes
 
 
 def load_expert(name: str) -> Policy:
-    """The stored policy of an expert. Raises ``ValueError`` for a name that is not in :data:`EXPERTS`."""
+    """Load the stored policy of an expert. Raises as :func:`load_demonstrations`."""
     task, facts = expert_task(name), load_facts(name)
     template = jax.eval_shape(
         lambda key: policy_network(key, task.observation_size, task.actions, facts["settings"]["hidden"]),
         jax.random.key(0),
     )
     paths, structure = jax.tree_util.tree_flatten_with_path(template)
-    with np.load(FOLDER / f"{name}-policy.npz", allow_pickle=False) as arrays:
-        leaves = [jnp.asarray(arrays[_name(path)]) for path, _ in paths]
-    return jax.tree_util.tree_unflatten(structure, leaves)
+    path, names = FOLDER / f"{name}-policy.npz", [_name(at) for at, _ in paths]
+    arrays = read_arrays(path, dict.fromkeys(names, "f"), required=names, what="archive of a policy")
+    for leaf, (_, like) in zip(names, paths, strict=True):
+        if arrays[leaf].shape != like.shape:
+            raise StorageError(
+                f"{path}: the array {leaf!r} must have shape {like.shape}; got {arrays[leaf].shape}"
+            )
+    return jax.tree_util.tree_unflatten(structure, [jnp.asarray(arrays[leaf]) for leaf in names])
 
 
 def load_facts(name: str) -> dict[str, Any]:
-    """How an expert was trained, and the returns of its stored episodes. Raises as :func:`load_expert`."""
-    return json.loads((FOLDER / f"{_known(name)}.json").read_text())
+    """Load how an expert was trained, and the returns of its stored episodes.
+
+    Raises as :func:`load_demonstrations`.
+    """
+    path = FOLDER / f"{_known(name)}.json"
+    try:
+        facts = parsed_json(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        raise StorageError(f"{path}: {error}") from None
+    if not isinstance(facts, dict) or not isinstance(facts.get("settings"), dict):
+        raise StorageError(f"{path}: the facts of an expert must have settings; got {shortened(facts)}")
+    return facts
 
 
 def store_expert(

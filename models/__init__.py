@@ -8,6 +8,7 @@ import jax
 
 jax.config.update("jax_enable_x64", True)
 
+from .archives import StorageError
 from .confusions import Confusions
 from .demonstration import (
     Demonstration,
@@ -69,6 +70,7 @@ __all__ = [
     "Sensor",
     "ShiftSensor",
     "SoftPlan",
+    "StorageError",
     "TabularMDP",
     "TrajectoryLaw",
     "Visibility",

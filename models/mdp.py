@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -24,6 +25,7 @@ _MAX_INFLOW_RATIO = 6
 # Nor does the table pay on its own where states are so many that nobody maps over a batch of such processes:
 # there scattering is 3 times faster (6 ms against 18 at 300 000 states).
 _MAX_INFLOW_STATES = 10_000
+_SURROGATE = re.compile("[\ud800-\udfff]")
 
 
 @dataclass(frozen=True)
@@ -392,6 +394,10 @@ def _checked_labels(
             continue
         if len(names) != sizes[kind]:
             raise ValueError(f"{len(names)} {kind} names were given for {sizes[kind]} {kind}s")
+        # Lone surrogates cannot be written to any file or terminal.
+        if not all(name.isascii() or _SURROGATE.search(name) is None for name in names):
+            wrong = next(name for name in names if _SURROGATE.search(name))
+            raise ValueError(f"{kind} names must be text; got {shortened(wrong)}, half a character")
         if len(set(names)) != len(names):
             repeated = [name for name, count in Counter(names).items() if count > 1]
             raise ValueError(f"{kind} names must differ; repeated: {listed(repeated)}")

@@ -22,6 +22,7 @@ from i2rl.domains.experts import (
     train_expert,
 )
 from i2rl.domains.locomotion import ROBOTS, locomotion
+from i2rl.models import StorageError
 
 
 @pytest.mark.parametrize("name", EXPERTS)
@@ -123,3 +124,32 @@ def test_unknown_experts_are_named():
     for ask in (load_expert, load_demonstrations, load_facts, expert_task):
         with pytest.raises(ValueError, match="hopper, walker2d, half-cheetah, mountain-car; got 'ant'"):
             ask("ant")
+
+
+def test_damaged_recordings_are_refused_by_file(tmp_path, monkeypatch):
+    stored = {name: np.array(value) for name, value in load_demonstrations("mountain-car")._asdict().items()}
+    monkeypatch.setattr(experts, "FOLDER", tmp_path)
+    path = tmp_path / "mountain-car-demonstrations.npz"
+    for changes, message in (
+        ({"rewards": stored["rewards"][:, :5]}, r"'observations' of shape .* does not fit rewards"),
+        ({"lengths": stored["lengths"] + 10**6}, r"'lengths' must lie between 0 and"),
+        ({"terminated": stored["terminated"].astype(int)}, r"'terminated' must hold booleans; got integers"),
+        ({"colour": np.zeros(3)}, r"unknown array 'colour'"),
+    ):
+        np.savez(path, **{**stored, **changes})
+        with pytest.raises(StorageError, match=rf"mountain-car-demonstrations\.npz.*{message}"):
+            load_demonstrations("mountain-car")
+    for text, message in (
+        ("[" * 10**5, "nested too deeply"),
+        ("[]", "must have settings"),
+        ("\xff", "utf-8"),
+    ):
+        (tmp_path / "mountain-car.json").write_text(text, encoding="latin-1")
+        with pytest.raises(StorageError, match=rf"mountain-car\.json: .*{message}"):
+            load_expert("mountain-car")
+    (tmp_path / "mountain-car.json").write_text('{"settings": {"hidden": [4]}}')
+    np.savez(tmp_path / "mountain-car-policy.npz", a=np.zeros(3))
+    with pytest.raises(
+        StorageError, match=r"mountain-car-policy\.npz: an archive of a policy has an unknown"
+    ):
+        load_expert("mountain-car")

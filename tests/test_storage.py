@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from i2rl.domains.patrol import instance
-from i2rl.models import TabularMDP
+from i2rl.models import StorageError, TabularMDP
 from i2rl.models.storage import load_mdp, save_mdp
 
 # Digests of the patrols as journals have kept them since before starts kept their bits.
@@ -105,7 +105,7 @@ def test_errors_name_the_file_and_the_fault(tmp_path, changes, message):
 
 def test_pickles_are_refused(tmp_path):
     write_archive(tmp_path / "m.npz", states=np.array([object(), object()], dtype=object))
-    with pytest.raises(ValueError, match="not an MDP archive"):
+    with pytest.raises(StorageError, match=r"m\.npz: the array 'states' must hold text .*; got objects"):
         load_mdp(tmp_path / "m.npz")
 
 
