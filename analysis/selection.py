@@ -65,7 +65,7 @@ def with_features(
     Raises ``ValueError`` for features of another shape or not finite where an action is available, and for
     names of the wrong number or repeated.
     """
-    checked = TabularMDP.from_successors(
+    return TabularMDP.from_successors(
         np.asarray(mdp.successors),
         np.asarray(mdp.probabilities),
         features,
@@ -76,8 +76,6 @@ def with_features(
         actions=mdp.labels.actions,
         feature_names=names,
     )
-    # To the bit the same process otherwise: building it anew rounds probabilities once more.
-    return replace(mdp, features=checked.features, labels=checked.labels)
 
 
 def select_features(mdp: TabularMDP, names: Sequence[str]) -> TabularMDP:

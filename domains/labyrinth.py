@@ -13,6 +13,7 @@ pair, and deterministic moves named after where they lead: ``back`` to the paren
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache, partial
 from itertools import pairwise
@@ -24,17 +25,22 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..models.demonstration import (
+    DEFAULT_LIMITS,
     HIDDEN,
     SEEN,
     UNKNOWN,
     Demonstration,
     DemonstrationError,
+    LineLimits,
     concatenate,
+    identity_of,
     parsed_lines,
+    require_few,
 )
 from ..models.evidence import Visibility
 from ..models.mdp import TabularMDP
 from ..models.planning import reward_of, simulate, soft_plan
+from ..models.text import shortened
 
 LEVELS = 6
 N_NODES = 2 ** (LEVELS + 1) - 1
@@ -207,28 +213,31 @@ class Bout(NamedTuple):
     frames: tuple[int, ...] | None = None
 
 
-def read_bouts(lines: Iterable[str], source: str = "input") -> Iterator[Bout]:
+def read_bouts(
+    lines: Iterable[str | bytes], source: str = "input", limits: LineLimits = DEFAULT_LIMITS
+) -> Iterator[Bout]:
     """Read a recording of junction sequences from JSON Lines, one bout a line.
 
     A line is ``{"nodes": [0, 2, ..., 127]}``, optionally with ``id`` (string) and ``frames`` (as many
     numbers, not decreasing). Blank lines are skipped. A bout begins at node 0; every step goes to the
     parent or to a child; home may only be the last node. A bout that does not end at home is accepted: the
-    recording stopped while the animal was inside. Raises :class:`DemonstrationError` naming ``source``,
-    line and position in ``nodes``.
+    recording stopped while the animal was inside. ``limits`` bounds the characters and nodes of a line.
+    Raises :class:`DemonstrationError` naming ``source``, line and position in ``nodes``.
     """
-    for _, where, content in parsed_lines(lines, source):
+    for _, where, content in parsed_lines(lines, source, limits=limits):
         if not isinstance(content, dict) or not isinstance(content.get("nodes"), list):
             raise DemonstrationError(f'{where}: a bout is an object with a list "nodes"')
-        unknown = set(content) - {"id", "nodes", "frames"}
+        unknown = content.keys() - {"id", "nodes", "frames"}
         if unknown:
             raise DemonstrationError(
-                f"{where}: unknown field {sorted(unknown)[0]!r}; a bout has id, nodes and frames"
+                f"{where}: unknown field {shortened(min(unknown))}; a bout has id, nodes and frames"
             )
         nodes, frames = content["nodes"], content.get("frames")
+        require_few(len(nodes), "nodes", where, limits)
         _check_nodes(nodes, where)
         if frames is not None:
             _check_frames(frames, len(nodes), where)
-        identity = None if content.get("id") is None else str(content["id"])
+        identity = identity_of(content.get("id"), where)
         yield Bout(identity, tuple(nodes), None if frames is None else tuple(frames))
 
 
@@ -238,7 +247,8 @@ def _check_nodes(nodes: list[Any], where: str) -> None:
     for t, node in enumerate(nodes):
         if isinstance(node, bool) or not isinstance(node, int) or not 0 <= node <= HOME:
             raise DemonstrationError(
-                f"{where}, nodes[{t}]: unknown node {node!r}; nodes are 0 to {N_NODES - 1}; {HOME} is home"
+                f"{where}, nodes[{t}]: unknown node {shortened(node)}; nodes are 0 to {N_NODES - 1}; {HOME} "
+                "is home"
             )
     if nodes[0] != 0:
         raise DemonstrationError(f"{where}, nodes[0]: a bout begins at node 0, got {nodes[0]}")
@@ -256,15 +266,17 @@ def _check_nodes(nodes: list[Any], where: str) -> None:
 
 def _check_frames(frames: Any, n_nodes: int, where: str) -> None:
     if not isinstance(frames, list) or len(frames) != n_nodes:
-        given = len(frames) if isinstance(frames, list) else repr(frames)
+        given = len(frames) if isinstance(frames, list) else shortened(frames)
         raise DemonstrationError(
             f"{where}: frames must be a list of one number per node ({n_nodes}), got {given}"
         )
     for t, frame in enumerate(frames):
-        if isinstance(frame, bool) or not isinstance(frame, int | float):
-            raise DemonstrationError(f"{where}, frames[{t}]: a frame is a number, got {frame!r}")
+        if isinstance(frame, bool) or not isinstance(frame, int | float) or not abs(frame) < math.inf:
+            raise DemonstrationError(f"{where}, frames[{t}]: a frame is a number, got {shortened(frame)}")
         if t and frame < frames[t - 1]:
-            raise DemonstrationError(f"{where}, frames[{t}]: frames go backwards, {frames[t - 1]} to {frame}")
+            raise DemonstrationError(
+                f"{where}, frames[{t}]: frames go backwards, {shortened(frames[t - 1])} to {shortened(frame)}"
+            )
 
 
 def pairs_of(maze: Labyrinth, nodes: Sequence[int]) -> tuple[Int[np.ndarray, " L"], Int[np.ndarray, " L"]]:

@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..models.sensing import Recording, RecordingError, recording
+from ..models.text import shortened
 from .onion_reaching import BLEMISHED, GONE, ONIONS, SIZE, STRIDE, UNBLEMISHED
 from .simulation import Trajectories
 
@@ -31,9 +32,8 @@ def read_onion_recordings(folder: Path | str, stride: float = STRIDE) -> Recordi
     states and actions that are not equally many.
     """
     folder = Path(folder)
-    numbers = sorted(
-        int(match[1]) for path in folder.glob("states_*.csv") if (match := _NUMBERED.fullmatch(path.name))
-    )
+    found = [match[1] for path in folder.glob("states_*.csv") if (match := _NUMBERED.fullmatch(path.name))]
+    numbers = sorted(found, key=lambda number: (len(number.lstrip("0")), number.lstrip("0"), number))
     if not numbers:
         raise RecordingError(
             f"{folder} has no recordings: expected files states_1.csv and actions_1.csv, and so on"
@@ -70,30 +70,38 @@ def write_onion_recordings(
     return paths
 
 
-_NUMBERED = re.compile(r"states_(\d+)\.csv")
+_NUMBERED = re.compile(r"states_([0-9]+)\.csv")
+# Python also reads 1_000 and digits of other scripts.
+_NUMBER = re.compile(r"\s*[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?\s*")
+_MAX_ROW = 4096
 
 
 def _rows(path: Path, width: int) -> Float[np.ndarray, "rows width"]:
     if not path.exists():
         raise RecordingError(f"{path} is missing; each recording has one file of states and one of actions")
     rows = []
-    for r, line in enumerate(path.read_text(encoding="utf-8-sig").splitlines(), 1):
-        cells = line.split(",")
-        if len(cells) != width:
-            raise RecordingError(f"{path}, row {r}: {len(cells)} columns, expected {width}")
-        rows.append([_number(path, r, c, cell) for c, cell in enumerate(cells, 1)])
+    with path.open("rb") as file:
+        for r, line in enumerate(iter(lambda: file.readline(_MAX_ROW + 1), b""), 1):
+            if len(line) > _MAX_ROW:
+                raise RecordingError(f"{path}, row {r}: a row must have at most {_MAX_ROW} characters")
+            try:
+                cells = line.decode("utf-8-sig" if r == 1 else "utf-8").rstrip("\r\n").split(",")
+            except UnicodeDecodeError as error:
+                raise RecordingError(f"{path}, row {r}: not UTF-8 text at byte {error.start + 1}") from None
+            if len(cells) != width:
+                raise RecordingError(f"{path}, row {r}: {len(cells)} columns, expected {width}")
+            rows.append(np.array([_number(path, r, c, cell) for c, cell in enumerate(cells, 1)]))
     if len(rows) < 2:
         raise RecordingError(f"{path} has {len(rows)} row(s); at least 2 are needed")
     return np.array(rows)
 
 
 def _number(path: Path, row: int, column: int, cell: str) -> float:
-    try:
-        number = float(cell)
-    except ValueError:
-        number = np.nan
+    number = float(cell) if _NUMBER.fullmatch(cell) else np.nan
     if not np.isfinite(number):
-        raise RecordingError(f"{path}, row {row}, column {column}: {cell.strip()!r} is not a finite number")
+        raise RecordingError(
+            f"{path}, row {row}, column {column}: {shortened(cell.strip())} is not a finite number"
+        )
     return number
 
 

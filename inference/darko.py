@@ -298,9 +298,10 @@ def stopping_places(stream: Iterable[Demonstration], n_states: int, steps: int) 
 def ending_at(mdp: TabularMDP, goals: Bool[np.ndarray, " S"]) -> TabularMDP:
     """The process in which reaching a goal ends the task, as DARKO's planner has it.
 
-    One state is added, the last, which is never left and has no features; every move to a goal from another
-    state leads there instead. The goals stay as states to start from and to wait in, since a session begins
-    where the last one ended. DARKO plans for one goal at a time; here all of them end the task alike. To
+    One state is added, the last, which is never left and has no features. Where states have names it is
+    "end", or "end 2" if a state has that name. Every move to a goal from another state leads there instead.
+    The goals stay as states to start from and to wait in, since a session begins where the last one ended.
+    DARKO plans for one goal at a time; here all of them end the task alike. To
     learn from an episode append the end as its last step (:func:`with_end`), or the model takes the last
     move to have failed, perhaps. Raises ``ValueError`` for marks of the wrong shape, or none.
     """
@@ -327,8 +328,14 @@ def ending_at(mdp: TabularMDP, goals: Bool[np.ndarray, " S"]) -> TabularMDP:
         discount=float(mdp.discount),
         available=np.concatenate([available, np.arange(mdp.n_actions)[None] == 0]),
     )
-    states = None if names.states is None else (*names.states, "end")
+    states = None if names.states is None else (*names.states, _new_name("end", names.states))
     return replace(ended, labels=Labels(states, names.actions, names.features))
+
+
+def _new_name(name: str, taken: tuple[str, ...]) -> str:
+    """The name, numbered if it is taken."""
+    candidates = (name, *(f"{name} {i}" for i in range(2, len(taken) + 3)))
+    return next(candidate for candidate in candidates if candidate not in taken)
 
 
 def with_end(session: Demonstration, end: int) -> Demonstration:

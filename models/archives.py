@@ -158,8 +158,8 @@ def _header(archive: zipfile.ZipFile, name: str, entry: zipfile.ZipInfo, allowed
     begin, size = len(magic) + width + length, n_elements * dtype.itemsize
     if not size or begin + size != entry.file_size:
         raise StorageError(
-            f"the array {name!r} of shape {shortened(shape)} must take {shortened(size)} bytes, at least one; "
-            f"there are {entry.file_size - begin}"
+            f"the array {name!r} of shape {shortened(shape)} must take {shortened(size)} bytes, at least 1; "
+            f"got {entry.file_size - begin}"
         )
     return _Header(dtype, fortran_order, shape, n_elements, begin)
 

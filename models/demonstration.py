@@ -9,18 +9,22 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterable, Iterator, Sequence
-from typing import IO, Any, NamedTuple
+from pathlib import PurePath
+from typing import IO, Any, NamedTuple, NoReturn
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from .mdp import TabularMDP
+from .text import JSONError, JSONSyntaxError, listed, parsed_json, shortened
 
 PAD, SEEN, HIDDEN, LOST = 0, 1, 2, 3
 UNKNOWN = -1
+_SURROGATE = re.compile("[\ud800-\udfff]")
 
-Step = dict[str, Any] | tuple[Any, Any] | str | None
+Step = dict[str, Any] | tuple[Any, Any] | list[Any] | np.ndarray | str | None
 
 
 class DemonstrationError(ValueError):
@@ -74,29 +78,79 @@ class Demonstration(NamedTuple):
 
     @staticmethod
     def from_pairs(states: Int[np.ndarray, "n L"], actions: Int[np.ndarray, "n L"]) -> Demonstration:
-        """Fully observed trajectories of one length."""
-        states = np.atleast_2d(np.asarray(states, np.int32))
-        actions = np.atleast_2d(np.asarray(actions, np.int32))
-        if states.shape != actions.shape:
-            raise ValueError(
-                f"states and actions must have one shape, got {states.shape} and {actions.shape}"
-            )
-        return Demonstration(
-            np.full(states.shape, SEEN, np.int8), states, actions, np.full(states.shape, np.nan)
+        """Build fully observed trajectories of one length from whole numbers ``[n, L]`` or ``[L]``.
+
+        Floats must be whole. Use :meth:`from_arrays` if steps are hidden or trajectories differ in length.
+        Raises :class:`DemonstrationError` naming trajectory and step, ``ValueError`` for other shapes and
+        ``TypeError`` for arrays of something else.
+        """
+        return _from_arrays(states, actions, complete=True)
+
+    @staticmethod
+    def from_arrays(
+        states: Int[np.ndarray, "n L"],
+        actions: Int[np.ndarray, "n L"],
+        *,
+        seen: Bool[np.ndarray, "n L"] | None = None,
+        lost: Bool[np.ndarray, "n L"] | None = None,
+        lengths: Int[np.ndarray, " n"] | None = None,
+        scores: Float[np.ndarray, "n L"] | None = None,
+        missing: float | None = None,
+    ) -> Demonstration:
+        """Build trajectories from arrays in which steps may be hidden.
+
+        Arrays are NumPy's, JAX's, masked arrays, or pandas' series and frames (a row is a trajectory). A
+        coordinate is unknown where its array is masked, where pandas has a missing value, or where it equals
+        ``missing``. A step of which both coordinates are unknown is hidden.
+
+        Parameters
+        ----------
+        states, actions : int ``[n, L]`` or ``[L]``
+            Whole numbers; floats are accepted if they are whole.
+        seen : bool ``[n, L]``, optional
+            False hides a step, whatever the arrays hold there: somebody looked and saw nothing.
+        lost : bool ``[n, L]``, optional
+            True marks a lost frame, whatever the arrays hold there: nobody looked.
+        lengths : int ``[n]``, optional
+            Steps of each trajectory; what follows is padding, whatever the arrays hold there.
+        scores : float ``[n, L]``, optional
+            Perception's confidence in [0, 1]; NaN where it gave none.
+        missing : number, optional
+            A value that stands for an unknown coordinate, such as -1 or NaN.
+
+        Raises
+        ------
+        DemonstrationError
+            For a number that is not whole, negative or beyond 32 bits, for a score outside [0, 1], and for a
+            step that ``seen`` calls seen without a state and an action; names trajectory and step.
+        ValueError
+            For arrays of other shapes, and lengths outside 0 to ``L``.
+        TypeError
+            For arrays of something else than numbers.
+
+        Examples
+        --------
+        >>> demo = Demonstration.from_arrays([[0, 1, -1], [2, 0, 0]], [[1, 1, -1], [0, 0, 0]],
+        ...                                  lengths=[3, 2], missing=-1)
+        >>> demo.kind.tolist()
+        [[1, 1, 2], [1, 1, 0]]
+        """
+        return _from_arrays(
+            states, actions, seen=seen, lost=lost, lengths=lengths, scores=scores, missing=missing
         )
 
     @staticmethod
-    def from_steps(trajectories: Iterable[Sequence[Step]], mdp: TabularMDP) -> Demonstration:
-        """From lists of steps as in the interchange format (pairs may also be tuples ``(s, a)``).
+    def from_steps(
+        trajectories: Iterable[Sequence[Step] | Int[np.ndarray, "L 2"]], mdp: TabularMDP
+    ) -> Demonstration:
+        """Build from lists of steps as in the interchange format.
 
-        Raises :class:`DemonstrationError` naming trajectory and step.
+        A seen pair may also be a tuple, a list or an array ``(s, a)``, and a trajectory an array ``[L, 2]``.
+        Raises :class:`DemonstrationError` naming trajectory and step, ``TypeError`` for what is not a list
+        of lists of steps.
         """
         names = _Names(mdp)
-        rows = [
-            [names.step(step, f"trajectory {i}, step {t}") for t, step in enumerate(steps)]
-            for i, steps in enumerate(trajectories)
-        ]
-        return _stack(rows)
+        return _stack([_row(steps, names, i) for i, steps in enumerate(_iterated(trajectories))])
 
     def select(self, rows: slice | np.ndarray | list[int]) -> Demonstration:
         """Some of the trajectories."""
@@ -154,74 +208,257 @@ def _power_of_two(n: int) -> int:
 
 def _stack(rows: list[list[tuple[int, int, int, float]]]) -> Demonstration:
     width = max((len(row) for row in rows), default=0)
-    shape = (len(rows), max(width, 1))
-    demo = Demonstration(
+    demo = _padding((len(rows), max(width, 1)))
+    for i, row in enumerate(rows):
+        for array, values in zip(demo, zip(*row, strict=True), strict=False):
+            array[i, : len(row)] = values
+    return demo
+
+
+def _padding(shape: tuple[int, ...]) -> Demonstration:
+    return Demonstration(
         np.full(shape, PAD, np.int8), np.full(shape, UNKNOWN, np.int32),
         np.full(shape, UNKNOWN, np.int32), np.full(shape, np.nan),
     )  # fmt: skip
-    for i, row in enumerate(rows):
-        for t, values in enumerate(row):
-            for array, value in zip(demo, values, strict=True):
-                array[i, t] = value
+
+
+def _iterated(trajectories: Any) -> Iterator[Any]:
+    named = isinstance(trajectories, str | bytes | dict | Demonstration)
+    if named or not isinstance(trajectories, Iterable):
+        raise TypeError(
+            f"trajectories must be a list of lists of steps; got a {type(trajectories).__name__}: "
+            f"{shortened(trajectories)}"
+        )
+    return iter(trajectories)
+
+
+def _row(steps: Any, names: _Names, trajectory: int) -> list[tuple[int, int, int, float]]:
+    if isinstance(steps, str | bytes | dict) or not isinstance(steps, Iterable):
+        raise TypeError(
+            f"a trajectory must be a list of steps or an array [L, 2]; got {shortened(steps)} "
+            f"(trajectory {trajectory})"
+        )
+    row = []
+    for t, step in enumerate(steps):
+        if isinstance(step, list) or (isinstance(step, np.ndarray) and step.ndim):
+            step = tuple(step)
+        try:
+            row.append(names.step(step))
+        except DemonstrationError as error:
+            raise DemonstrationError(f"trajectory {trajectory}, step {t}: {error}") from None
+    return row
+
+
+# -- arrays -------------------------------------------------------------------------------------------
+
+
+def _from_arrays(
+    states: Any,
+    actions: Any,
+    *,
+    seen: Any = None,
+    lost: Any = None,
+    lengths: Any = None,
+    scores: Any = None,
+    missing: float | None = None,
+    complete: bool = False,
+) -> Demonstration:
+    """As :meth:`Demonstration.from_arrays`; where it is ``complete``, nothing may be missing."""
+    (s, no_state), (a, no_action) = (
+        _numbers(name, given, missing) for name, given in (("states", states), ("actions", actions))
+    )
+    if s.shape != a.shape:
+        raise ValueError(f"states and actions must have one shape, got {s.shape} and {a.shape}")
+    n, width = s.shape
+    ends = _lengths(lengths, n, width)
+    live = np.arange(width) < ends[:, None]
+    gone = np.zeros(s.shape, bool) if lost is None else _flags("lost", lost, s.shape)
+    shown = ~(no_state & no_action) if seen is None else _flags("seen", seen, s.shape)
+    contradicted = live & ~gone & shown & no_state & no_action
+    if contradicted.any():
+        _refuse(contradicted, "a seen step must have a state or an action; both are missing")
+    hint = "; from_arrays takes hidden steps" if complete else "; `missing` names a value for hidden steps"
+    if complete and (no_state | no_action).any():
+        _refuse(no_state | no_action, f"states and actions must not be missing{hint}")
+    here = live & ~gone & shown
+    known = here & ~no_state, here & ~no_action
+    demo = _padding(s.shape)
+    demo.kind[...] = np.where(live, np.where(gone, LOST, np.where(shown, SEEN, HIDDEN)), PAD)
+    demo.state[...] = _indices("states", s, known[0], hint)
+    demo.action[...] = _indices("actions", a, known[1], hint)
+    if scores is not None:
+        given, unscored = _numbers("scores", scores, None)
+        if given.shape != s.shape:
+            raise ValueError(f"scores must have shape {s.shape}, got {given.shape}")
+        score = np.where(here & ~unscored, given, np.nan).astype(float)
+        wrong = (score < 0) | (score > 1)
+        if wrong.any():
+            _refuse(wrong, f"scores must lie in [0, 1]; got {score[wrong][0]}")
+        demo.score[...] = score
     return demo
+
+
+def _numbers(name: str, given: Any, missing: float | None) -> tuple[np.ndarray, Bool[np.ndarray, "n L"]]:
+    """Numbers ``[n, L]`` of any type, and which of them are missing."""
+    absent: Any = False
+    if hasattr(given, "isna") and hasattr(given, "to_numpy"):  # pandas
+        absent = np.asarray(given.isna())
+        # Integers of 64 bits would become floats where one is missing, and then be rounded.
+        given = given.to_numpy(dtype=object, na_value=0) if absent.any() else given.to_numpy()
+    elif isinstance(given, list | tuple) and any(isinstance(row, np.ma.MaskedArray) for row in given):
+        given = np.ma.stack(given)
+    if isinstance(given, np.ma.MaskedArray):
+        absent, given = np.ma.getmaskarray(given), given.data
+    try:
+        array = np.asarray(given)
+    except ValueError:
+        raise ValueError(
+            f"{name} must be an array [n, L]; got rows of different lengths: pad them and give lengths"
+        ) from None
+    if array.dtype.kind == "O" and all(type(x) in (int, float) for x in array.flat):
+        whole = all(type(x) is int and -(2**63) <= x < 2**63 for x in array.flat)
+        array = array.astype(np.int64) if whole else np.vectorize(_as_float, otypes=[float])(array)
+    if array.dtype.kind not in "iuf":
+        raise TypeError(f"{name} must be numbers; got {array.dtype} (from_steps takes names)")
+    if array.ndim not in (1, 2) or array.shape[-1] == 0:
+        raise ValueError(f"{name} must have shape [n, L] or [L] with at least one step, got {array.shape}")
+    absent = np.broadcast_to(absent, array.shape)
+    if missing is not None:
+        absent = absent | (np.isnan(array) if missing != missing else array == missing)
+    return np.atleast_2d(array), np.atleast_2d(absent)
+
+
+def _as_float(number: float) -> float:
+    try:
+        return float(number)
+    except OverflowError:
+        return math.inf
+
+
+def _indices(
+    name: str, numbers: np.ndarray, known: Bool[np.ndarray, "n L"], hint: str
+) -> Int[np.ndarray, "n L"]:
+    """Known numbers as indices, others ``UNKNOWN``."""
+    with np.errstate(invalid="ignore"):
+        wrong = known & ~((numbers >= 0) & (numbers < 2**31) & (numbers == np.floor(numbers)))
+    if wrong.any():
+        value = numbers[wrong][0]
+        advice = "" if value >= 0 else hint
+        _refuse(wrong, f"{name} must be whole numbers from 0 to 2147483647; got {value}{advice}")
+    indices = np.full(numbers.shape, UNKNOWN, np.int32)
+    indices[known] = numbers[known]
+    return indices
+
+
+def _flags(name: str, given: Any, shape: tuple[int, ...]) -> Bool[np.ndarray, "n L"]:
+    array = np.atleast_2d(given.filled(False) if isinstance(given, np.ma.MaskedArray) else np.asarray(given))
+    if array.dtype != bool or array.shape != shape:
+        raise ValueError(f"{name} must be booleans {list(shape)}; got {array.dtype} {list(array.shape)}")
+    return array
+
+
+def _lengths(given: Any, n: int, width: int) -> Int[np.ndarray, " n"]:
+    if given is None:
+        return np.full(n, width)
+    array = np.atleast_1d(np.asarray(given))
+    if array.shape != (n,) or array.dtype.kind not in "iu":
+        raise ValueError(f"lengths must be integers [{n}]; got {array.dtype} {list(array.shape)}")
+    wrong = np.flatnonzero((array < 0) | (array > width))
+    if len(wrong):
+        raise ValueError(
+            f"lengths must lie between 0 and {width}; got {array[wrong[0]]} (trajectory {wrong[0]})"
+        )
+    return array
+
+
+def _refuse(wrong: Bool[np.ndarray, "n L"], message: str) -> NoReturn:
+    i, t = np.argwhere(wrong)[0]
+    raise DemonstrationError(f"trajectory {i}, step {t}: {message}")
+
+
+# -- JSON Lines ---------------------------------------------------------------------------------------
 
 
 class _Names:
     """Resolves names and indices of states and actions, with errors in the user's terms."""
 
     def __init__(self, mdp: TabularMDP) -> None:
+        if not isinstance(mdp, TabularMDP):
+            more = "; pass its mdp" if isinstance(getattr(mdp, "mdp", None), TabularMDP) else ""
+            raise TypeError(f"mdp must be a TabularMDP; got a {type(mdp).__name__}{more}")
         self.counts = {"state": mdp.n_states, "action": mdp.n_actions}
         self.indices = {
             "state": _index(mdp.labels.states, "s", mdp.n_states),
             "action": _index(mdp.labels.actions, "a", mdp.n_actions),
         }
 
-    def resolve(self, value: Any, kind: str, where: str) -> int:
+    def resolve(self, value: Any, kind: str) -> int:
         count = self.counts[kind]
         if isinstance(value, bool) or not isinstance(value, int | np.integer | str):
-            raise DemonstrationError(f"{where}: {kind} must be a name or an index, got {value!r}")
+            raise DemonstrationError(f"{kind} must be a name or an index, got {shortened(value)}")
         if isinstance(value, str):
             index = self.indices[kind].get(value)
             if index is None:
-                known = ", ".join(list(self.indices[kind])[:4])
-                raise DemonstrationError(f"{where}: unknown {kind} {value!r}; known are {known}, ...")
+                raise DemonstrationError(
+                    f"unknown {kind} {shortened(value)}; known are {listed(self.indices[kind])}"
+                )
             return index
         if not 0 <= value < count:
             raise DemonstrationError(
-                f"{where}: {kind} {value} is out of range; indices run from 0 to {count - 1}"
+                f"{kind} {shortened(value)} is out of range; indices run from 0 to {count - 1}"
             )
         return int(value)
 
-    def step(self, step: Step, where: str) -> tuple[int, int, int, float]:
+    def step(self, step: Any) -> tuple[int, int, int, float]:
+        """Kind, state, action and score of a step. Raises :class:`DemonstrationError`, without the place."""
         if step is None:
             return LOST, UNKNOWN, UNKNOWN, math.nan
-        if step == "hidden":
+        if isinstance(step, str) and step == "hidden":
             return HIDDEN, UNKNOWN, UNKNOWN, math.nan
         if isinstance(step, tuple) and len(step) == 2:
             step = {"s": step[0], "a": step[1]}
         if not isinstance(step, dict):
             raise DemonstrationError(
-                f'{where}: a step is {{"s": ..., "a": ...}}, "hidden" or null for a lost frame, got {step!r}'
+                f'a step is {{"s": ..., "a": ...}}, "hidden" or null for a lost frame, got {shortened(step)}'
             )
-        unknown = set(step) - {"s", "a", "score"}
+        unknown = step.keys() - {"s", "a", "score"}
         if unknown:
             raise DemonstrationError(
-                f"{where}: unknown field {sorted(unknown)[0]!r}; a step has s, a and score"
+                f"unknown field {shortened(min(unknown, key=str))}; a step has s, a and score"
             )
         if step.get("s") is None and step.get("a") is None:
-            raise DemonstrationError(f'{where}: a seen step needs "s" or "a"; write "hidden" or null instead')
-        state = UNKNOWN if step.get("s") is None else self.resolve(step["s"], "state", where)
-        action = UNKNOWN if step.get("a") is None else self.resolve(step["a"], "action", where)
+            raise DemonstrationError('a seen step needs "s" or "a"; write "hidden" or null instead')
+        state = UNKNOWN if step.get("s") is None else self.resolve(step["s"], "state")
+        action = UNKNOWN if step.get("a") is None else self.resolve(step["a"], "action")
         score = step.get("score")
         if score is None:
             return SEEN, state, action, math.nan
         if isinstance(score, bool) or not isinstance(score, int | float | np.number) or not 0 <= score <= 1:
-            raise DemonstrationError(f"{where}: score must lie in [0, 1], got {score!r}")
+            raise DemonstrationError(f"score must lie in [0, 1], got {shortened(score)}")
         return SEEN, state, action, float(score)
 
 
 def _index(names: tuple[str, ...] | None, prefix: str, count: int) -> dict[str, int]:
     return {name: i for i, name in enumerate(names or (f"{prefix}{i}" for i in range(count)))}
+
+
+class LineLimits(NamedTuple):
+    """How large a line of a file may be, so that reading it takes bounded memory.
+
+    Fields
+    ------
+    characters : int
+        Characters of a line. Parsing takes up to 30 bytes of memory for each; 4 Mi by default.
+    steps : int
+        Steps of a trajectory, or nodes of a bout; 10,000 by default. A learner's memory grows with them times
+        states times actions.
+    """
+
+    characters: int = 4 * 2**20
+    steps: int = 10_000
+
+
+DEFAULT_LIMITS = LineLimits()
 
 
 class Record(NamedTuple):
@@ -233,26 +470,62 @@ class Record(NamedTuple):
     demonstration: Demonstration
 
 
-def parsed_lines(lines: Iterable[str], source: str, first_line: int = 1) -> Iterator[tuple[int, str, Any]]:
-    """Number, place for messages, and content of each line of JSON Lines; blank lines are skipped.
+def parsed_lines(
+    lines: Iterable[str | bytes], source: str, first_line: int = 1, limits: LineLimits = DEFAULT_LIMITS
+) -> Iterator[tuple[int, str, Any]]:
+    """Yield number, place for messages, and content of each line of JSON Lines; blank lines are skipped.
 
-    Raises :class:`DemonstrationError` naming ``source`` and line.
+    Bytes are decoded from UTF-8; a byte order mark may begin the first line of a file. Raises
+    :class:`DemonstrationError` naming ``source`` and line for what is not JSON, and for lines longer than
+    ``limits.characters``; ``TypeError`` for what is not lines.
     """
-    for number, line in enumerate(lines, start=first_line):
-        if not line.strip():
-            continue
+    if isinstance(lines, str | bytes | PurePath):
+        raise TypeError(f"lines must be an open file or a list of lines; got {shortened(lines)}")
+    for number, line in enumerate(_decodable(lines, source, first_line), start=first_line):
         where = f"{source}, line {number}"
-        try:
-            yield number, where, json.loads(line)
-        except json.JSONDecodeError as error:
-            ending = "" if line.endswith("\n") else " (the line has no end: the file may have been cut off)"
+        if not isinstance(line, str | bytes):
+            raise TypeError(f"lines must be lines of text; got {shortened(line)} ({where})")
+        if len(line) > limits.characters:
             raise DemonstrationError(
-                f"{where}: not valid JSON at character {error.pos + 1}: {error.msg}{ending}"
-            ) from None
+                f"{where}: a line must have at most {limits.characters} characters; it has {len(line)}: "
+                "write shorter trajectories or raise the limit"
+            )
+        if isinstance(line, bytes):
+            try:
+                line = line.decode()
+            except UnicodeDecodeError as error:
+                raise DemonstrationError(f"{where}: not UTF-8 text at byte {error.start + 1}") from None
+        text = line.removeprefix("\ufeff") if number == 1 else line
+        if not text.strip():
+            continue
+        try:
+            yield number, where, parsed_json(text)
+        except JSONError as error:
+            cut = isinstance(error, JSONSyntaxError) and not line.endswith("\n")
+            ending = " (the line has no end: the file may have been cut off)" if cut else ""
+            raise DemonstrationError(f"{where}: {error}{ending}") from None
+
+
+def _decodable(lines: Iterable[str | bytes], source: str, first_line: int) -> Iterator[str | bytes]:
+    """The lines; where the file itself decodes them, errors say after which line."""
+    read = first_line - 1
+    try:
+        for line in lines:
+            yield line
+            read += 1
+    except UnicodeDecodeError as error:
+        # Files decode ahead of the lines that they yield.
+        raise DemonstrationError(
+            f"{source}, line {read + 1} or later: not UTF-8 text (byte {error.object[error.start]:#04x})"
+        ) from None
 
 
 def read_trajectories(
-    lines: Iterable[str], mdp: TabularMDP, source: str = "input", first_line: int = 1
+    lines: Iterable[str | bytes],
+    mdp: TabularMDP,
+    source: str = "input",
+    first_line: int = 1,
+    limits: LineLimits = DEFAULT_LIMITS,
 ) -> Iterator[Record]:
     """Read trajectories from JSON Lines, one at a time.
 
@@ -260,29 +533,56 @@ def read_trajectories(
     experts, an integer), or just the list of steps. A step is ``{"s": state, "a": action, "score": c}``
     (each by name or index; ``s`` or ``a`` may be missing if it was not perceived; ``score`` in [0, 1] is
     optional), ``"hidden"`` (looked, saw nothing) or ``null`` (a lost frame). Blank lines are skipped;
-    ``first_line`` is the number of the first one, for a reader that starts midway.
-    Raises :class:`DemonstrationError` naming ``source``, line and step.
+    ``first_line`` is the number of the first one, for a reader that starts midway. ``limits`` bounds the
+    characters and steps of a line, and so the memory that reading it takes. Raises
+    :class:`DemonstrationError` naming ``source``, line and step.
     """
     names = _Names(mdp)
-    for number, where, content in parsed_lines(lines, source, first_line):
+    for number, where, content in parsed_lines(lines, source, first_line, limits):
         identity = agent = None
         if isinstance(content, dict):
-            unknown = set(content) - {"steps", "id", "agent"}
+            unknown = content.keys() - {"steps", "id", "agent"}
             if unknown:
                 raise DemonstrationError(
-                    f"{where}: unknown field {sorted(unknown)[0]!r}; a trajectory has steps, id and agent"
+                    f"{where}: unknown field {shortened(min(unknown))}; a trajectory has steps, id and agent"
                 )
             if "steps" not in content:
                 raise DemonstrationError(f'{where}: a trajectory needs the field "steps"')
-            identity = None if content.get("id") is None else str(content["id"])
+            identity = identity_of(content.get("id"), where)
             agent = content.get("agent")
-            if agent is not None and (isinstance(agent, bool) or not isinstance(agent, int)):
-                raise DemonstrationError(f"{where}: agent must be an integer, got {agent!r}")
+            if agent is not None and not (type(agent) is int and -(2**63) <= agent < 2**63):
+                raise DemonstrationError(f"{where}: agent must be an integer, got {shortened(agent)}")
             content = content["steps"]
         if not isinstance(content, list) or not content:
             raise DemonstrationError(f"{where}: steps must be a list of at least one step")
-        row = [names.step(step, f"{where}, step {t}") for t, step in enumerate(content)]
+        require_few(len(content), "steps", where, limits)
+        row = []
+        for t, step in enumerate(content):
+            try:
+                row.append(names.step(step))
+            except DemonstrationError as error:
+                raise DemonstrationError(f"{where}, step {t}: {error}") from None
         yield Record(number, identity, agent, _stack([row]))
+
+
+def identity_of(value: Any, where: str) -> str | None:
+    """The ``id`` of a line, text or a number. Raises :class:`DemonstrationError`."""
+    if value is None:
+        return None
+    if isinstance(value, bool) or not isinstance(value, str | int | float):
+        raise DemonstrationError(f"{where}: id must be text, got {shortened(value)}")
+    if _SURROGATE.search(text := str(value)):
+        raise DemonstrationError(f"{where}: id must be text, got {shortened(text)}, with half a character")
+    return text
+
+
+def require_few(count: int, what: str, where: str, limits: LineLimits) -> None:
+    """Raise :class:`DemonstrationError` for more steps on a line than the limit."""
+    if count > limits.steps:
+        raise DemonstrationError(
+            f"{where}: a line must have at most {limits.steps} {what}; it has {count}: write shorter "
+            "trajectories or raise the limit"
+        )
 
 
 def write_trajectories(
@@ -295,37 +595,60 @@ def write_trajectories(
 ) -> None:
     """Write trajectories as JSON Lines, by name where the MDP has names, otherwise by index.
 
-    Rows that are all padding are no trajectories and are left out. ``ids`` and ``agents`` have an entry for
-    every row; ``ValueError`` if not.
+    Rows that are all padding are no trajectories and are left out. ``ids`` (text or integers) and ``agents``
+    (integers) have an entry for every row; ``ValueError`` if not, ``TypeError`` for other entries. Raises
+    :class:`DemonstrationError` naming trajectory and step for what could not be read back: states and actions
+    that the MDP lacks, a seen step without either, a score outside [0, 1].
     """
-    for field, given in (("ids", ids), ("agents", agents)):
-        if given is not None and len(given) != demonstration.n_trajectories:
-            raise ValueError(
-                f"{len(given)} {field} were given for {demonstration.n_trajectories} trajectories"
-            )
-    states, actions = mdp.labels.states, mdp.labels.actions
+    if not hasattr(file, "write"):
+        raise TypeError(f"file must be a file open for writing text; got {shortened(file)}")
+    names = _Names(mdp)
+    n = demonstration.n_trajectories
+    extra = {"id": _per_row("ids", ids, n, text=True), "agent": _per_row("agents", agents, n, text=False)}
+    arrays = [np.asarray(x) for x in demonstration]
     for i, total in enumerate(demonstration.lengths):
         if not total:
             continue
-        steps: list[Any] = []
-        for t in range(int(total)):
-            kind, s, a, score = (x[i, t] for x in demonstration)
-            if kind == HIDDEN:
-                steps.append("hidden")
-            elif kind == LOST:
-                steps.append(None)
-            else:
-                step: dict[str, Any] = {}
-                if s != UNKNOWN:
-                    step["s"] = states[s] if states else int(s)
-                if a != UNKNOWN:
-                    step["a"] = actions[a] if actions else int(a)
-                if not math.isnan(score):
-                    step["score"] = float(score)
-                steps.append(step)
-        record: dict[str, Any] = {}
-        if ids is not None:
-            record["id"] = ids[i]
-        if agents is not None:
-            record["agent"] = int(agents[i])
+        steps = []
+        for t, values in enumerate(zip(*(x[i, :total].tolist() for x in arrays), strict=True)):
+            try:
+                steps.append(_written(*values, names, mdp))
+            except DemonstrationError as error:
+                raise DemonstrationError(f"trajectory {i}, step {t}: {error}") from None
+        record = {field: entries[i] for field, entries in extra.items() if entries is not None}
         file.write(json.dumps(record | {"steps": steps}) + "\n")
+
+
+def _written(kind: int, state: int, action: int, score: float, names: _Names, mdp: TabularMDP) -> Any:
+    """A step as JSON. Raises :class:`DemonstrationError` for one that could not be read back."""
+    if kind in (HIDDEN, LOST):
+        return "hidden" if kind == HIDDEN else None
+    if kind != SEEN:
+        raise DemonstrationError(f"kind must be 1 (seen), 2 (hidden) or 3 (lost) before padding; got {kind}")
+    step: dict[str, Any] = {}
+    if state != UNKNOWN:
+        step["s"] = state
+    if action != UNKNOWN:
+        step["a"] = action
+    if not math.isnan(score):
+        step["score"] = score
+    names.step(step)
+    for field, labels in (("s", mdp.labels.states), ("a", mdp.labels.actions)):
+        if labels is not None and field in step:
+            step[field] = labels[step[field]]
+    return step
+
+
+def _per_row(field: str, given: Iterable[Any] | None, n: int, *, text: bool) -> list[Any] | None:
+    if given is None:
+        return None
+    entries = list(given)
+    if len(entries) != n:
+        raise ValueError(f"{len(entries)} {field} were given for {n} trajectories")
+    for i, entry in enumerate(entries):
+        if isinstance(entry, int | np.integer) and not isinstance(entry, bool):
+            entries[i] = str(entry) if text else int(entry)
+        elif not text or not isinstance(entry, str):
+            wanted = "text or integers" if text else "integers"
+            raise TypeError(f"{field} must be {wanted}; got {shortened(entry)} (trajectory {i})")
+    return entries
