@@ -46,6 +46,7 @@ from .assumptions import (
 )
 from .concentration import (
     Interval,
+    _positive,
     empirical_bernstein,
     predictable_bernstein,
     predictable_half_width,
@@ -449,12 +450,6 @@ def table_7_1b(n_features: int = 6, epsilon: float = 0.1, delta_s: float = 0.1) 
 def _probability(name: str, x: float) -> float:
     if not 0 < x < 1:
         raise ValueError(f"{name} must lie strictly between 0 and 1, got {x}")
-    return x
-
-
-def _positive(name: str, x: float) -> float:
-    if not (math.isfinite(x) and x > 0):
-        raise ValueError(f"{name} must be positive, got {x}")
     return x
 
 

@@ -77,9 +77,34 @@ class Domain(StrEnum):
     onion = "onion"
 
 
+def _count(help: str, least: int = 1, most: int = 10**7) -> Any:
+    """A whole number that can be counted to."""
+    return typer.Option(min=least, max=most, help=help)
+
+
+def _real(help: str, least: float | None = None, most: float | None = None) -> Any:
+    """A finite number; a range alone would let NaN pass."""
+    return typer.Option(min=least, max=most, help=help, callback=_finite)
+
+
+def _finite(value: float | None) -> float | None:
+    if value is not None and not math.isfinite(value):
+        raise typer.BadParameter(f"{value} is not a finite number.")
+    return value
+
+
+def _seed(help: str) -> Any:
+    """A seed; NumPy, JAX and PyMC take 32 bits without a sign."""
+    return typer.Option(min=0, max=2**32 - 1, help=help)
+
+
 Json = Annotated[bool, typer.Option("--json", help="Print JSON for machines instead of tables.")]
 Instance = Annotated[int, typer.Option(min=1, max=3, help="Patrol instance (1, 2 or 3).")]
-Seed = Annotated[int, typer.Option(help="Random seed; the same seed gives the same result.")]
+Seed = Annotated[int, _seed("Random seed; the same seed gives the same result.")]
+Percent = Annotated[
+    int | None,
+    _count("Percent of the patrol in view (100: everything); by default the instance's own.", 0, 100),
+]
 
 
 def _print_version(wanted: bool) -> None:
@@ -106,14 +131,11 @@ def _options(
 @run.command("patrol")
 def run_patrol(
     instance: Instance = 2,
-    observability: Annotated[
-        int | None,
-        typer.Option(help="Percent of the patrol in view; by default the dissertation's (30, 30, 18)."),
-    ] = None,
-    sessions: Annotated[int, typer.Option(min=1, help="Sessions of five steps a patroller.")] = 60,
+    observability: Percent = None,
+    sessions: Annotated[int, _count("Sessions of five steps a patroller.")] = 60,
     method: Annotated[Method, typer.Option(help="Which learners to run.")] = Method.all,
-    trials: Annotated[int, typer.Option(min=1, help="Simulated breaches per learned policy.")] = 200,
-    runs: Annotated[int, typer.Option(min=1, help="Independent repetitions.")] = 3,
+    trials: Annotated[int, _count("Simulated breaches per learned policy.")] = 200,
+    runs: Annotated[int, _count("Independent repetitions.")] = 3,
     seed: Seed = 0,
     report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report"),
     as_json: Json = False,
@@ -142,12 +164,8 @@ def run_labyrinth(
     hide_left: Annotated[
         bool, typer.Option(help="Learn also with the left half of the maze out of view.")
     ] = True,
-    discount: Annotated[
-        float | None, typer.Option(min=0, max=1, help="Discount of the animal's future.")
-    ] = None,
-    ridge: Annotated[
-        float | None, typer.Option(min=0, help="Precision of the weights' Gaussian prior.")
-    ] = None,
+    discount: Annotated[float | None, _real("Discount of the animal's future.", 0, 1)] = None,
+    ridge: Annotated[float | None, _real("Precision of the weights' Gaussian prior.", 0)] = None,
     report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-labyrinth"),
     as_json: Json = False,
 ) -> None:
@@ -156,7 +174,7 @@ def run_labyrinth(
     from . import labyrinth
 
     with _reported_errors(), _progress(as_json) as advance:
-        with recording.open(encoding="utf-8") as lines:
+        with recording.open("rb") as lines:
             bouts = list(read_bouts(lines, recording.name))
         study = labyrinth.study(
             bouts, recording=recording.stem, hide_left=hide_left,
@@ -178,21 +196,21 @@ def run_labyrinth(
 
 @app.command()
 def bounds(
-    features: Annotated[int | None, typer.Option(help="Number of reward features, K.")] = None,
-    epsilon: Annotated[float, typer.Option(help="Error of a feature's discounted average, in (0, 1).")] = 0.1,
-    confidence: Annotated[float, typer.Option(help="Probability with which the bound is to hold.")] = 0.8,
-    epsilon_s: Annotated[float, typer.Option(help="Error of sampling the hidden steps.")] = 0.05,
-    discount: Annotated[float | None, typer.Option(help="Discount; 0.99 unless --mdp says.")] = None,
+    features: Annotated[int | None, _count("Number of reward features, K.", most=10**6)] = None,
+    epsilon: Annotated[float, _real("Error of a feature's discounted average, below 1.", 1e-9, 1)] = 0.1,
+    confidence: Annotated[float, _real("Probability with which the bound is to hold.", 0, 1)] = 0.8,
+    epsilon_s: Annotated[float, _real("Error of sampling the hidden steps, below 1.", 1e-9, 1)] = 0.05,
+    discount: Annotated[float | None, _real("Discount, below 1; 0.99 unless --mdp says.", 0, 1)] = None,
     deviation: Annotated[
-        float | None, typer.Option(help="Standard deviation of the features' discounted averages.")
+        float | None, _real("Standard deviation of the features' discounted averages.", 0, 0.5)
     ] = None,
     mdp: Annotated[
         str | None, typer.Option(help="patrol1, patrol2 or patrol3: its features, discount and spread.")
     ] = None,
     predicates: Annotated[
-        int | None, typer.Option(help="Predicates whose reliabilities noisy perception is described by.")
+        int | None, _count("Predicates whose reliabilities noisy perception is described by.")
     ] = None,
-    steps: Annotated[int | None, typer.Option(help="Steps of a trajectory, with --predicates.")] = None,
+    steps: Annotated[int | None, _count("Steps of a trajectory, with --predicates.")] = None,
     as_json: Json = False,
 ) -> None:
     """Say how many demonstrations are enough: by the theorem, by tighter bounds, and what is assumed."""
@@ -211,8 +229,8 @@ def bounds(
 @run.command("methods")
 def run_methods(
     instance: Instance = 2,
-    sessions: Annotated[int, typer.Option(min=1, help="Sessions of five steps a patroller.")] = 120,
-    runs: Annotated[int, typer.Option(min=1, help="Independent repetitions.")] = 3,
+    sessions: Annotated[int, _count("Sessions of five steps a patroller.")] = 120,
+    runs: Annotated[int, _count("Independent repetitions.")] = 3,
     seed: Seed = 0,
     report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-methods"),
     as_json: Json = False,
@@ -232,9 +250,9 @@ def run_methods(
 
 @run.command("label-bias")
 def run_label_bias(
-    worlds: Annotated[int, typer.Option(min=1, help="Object Worlds drawn.")] = 100,
-    trajectories: Annotated[int, typer.Option(min=4, help="Expert trajectories a world.")] = 75,
-    walls: Annotated[int, typer.Option(min=0, help="Walls a world, of 100 cells.")] = 25,
+    worlds: Annotated[int, _count("Object Worlds drawn.")] = 100,
+    trajectories: Annotated[int, _count("Expert trajectories a world.", 4)] = 75,
+    walls: Annotated[int, _count("Walls a world, of 100 cells.", 0)] = 25,
     seed: Seed = 0,
     report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-label-bias"),
     as_json: Json = False,
@@ -254,7 +272,7 @@ def run_label_bias(
 
 @run.command("sorting")
 def run_sorting(
-    tasks: Annotated[int, typer.Option(help="Ways of sorting demonstrated, 2 or 3.")] = 2,
+    tasks: Annotated[int, _count("Ways of sorting demonstrated, 2 or 3.", 2, 3)] = 2,
     trajectories: Annotated[
         str | None,
         typer.Option(
@@ -265,12 +283,12 @@ def run_sorting(
     method: Annotated[MultiTask, typer.Option(help="Which learners to run.")] = MultiTask.all,
     sessions: Annotated[
         int | None,
-        typer.Option(help="Sessions of the online learner; they end at the numbers above unless given."),
+        _count("Sessions of the online learner; they end at the numbers above unless given."),
     ] = None,
-    ways: Annotated[int, typer.Option(help="Ways that MME-MTIRL starts from: the most it can find.")] = 4,
-    steps: Annotated[int, typer.Option(help="Steps of a trajectory.")] = 50,
-    runs: Annotated[int, typer.Option(help="Independent repetitions.")] = 3,
-    belts: Annotated[int, typer.Option(help="Simulated belts of Table 7.2.")] = 300,
+    ways: Annotated[int, _count("Ways that MME-MTIRL starts from: the most it can find.")] = 4,
+    steps: Annotated[int, _count("Steps of a trajectory.")] = 50,
+    runs: Annotated[int, _count("Independent repetitions.")] = 3,
+    belts: Annotated[int, _count("Simulated belts of Table 7.2.")] = 300,
     seed: Seed = 0,
     report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-sorting"),
     as_json: Json = False,
@@ -295,14 +313,10 @@ def run_sorting(
 @run.command("robust-airl")
 def run_robust_airl(
     domain: Annotated[Domain, typer.Option(help="Task, with its expert and its sensor.")] = Domain.hopper,
-    seeds: Annotated[int, typer.Option(min=1, help="Independent repetitions.")] = 1,
-    sessions: Annotated[
-        int | None, typer.Option(min=1, help="Sessions; by default the study's own number.")
-    ] = None,
-    noise: Annotated[
-        float, typer.Option(min=0, help="Times the study's noise (covariance, shift or probability).")
-    ] = 1.0,
-    workers: Annotated[int, typer.Option(min=1, help="Processes that share the runs.")] = 1,
+    seeds: Annotated[int, _count("Independent repetitions.")] = 1,
+    sessions: Annotated[int | None, _count("Sessions; by default the study's own number.")] = None,
+    noise: Annotated[float, _real("Times the study's noise (covariance, shift or probability).", 0)] = 1.0,
+    workers: Annotated[int, _count("Processes that share the runs.", most=1024)] = 1,
     kept: Annotated[
         Path | None, typer.Option(help="Folder where finished runs are kept and found again.")
     ] = None,
@@ -324,8 +338,8 @@ def run_robust_airl(
         print(f"Report: {report / 'index.html'}")
 
 
-NoisyRuns = Annotated[int, typer.Option(min=1, help="Independent repetitions.")]
-NoisySessions = Annotated[int, typer.Option(min=1, help="Sessions, of two trajectories of three pairs each.")]
+NoisyRuns = Annotated[int, _count("Independent repetitions.")]
+NoisySessions = Annotated[int, _count("Sessions, of two trajectories of three pairs each.")]
 StartsOption = Annotated[
     NoisyStarts,
     typer.Option(help="Trajectories start in all states alike, or where the task naturally does."),
@@ -337,7 +351,7 @@ def run_noisy_sorting(
     runs: NoisyRuns = 50,
     sessions: NoisySessions = 20,
     starts: StartsOption = NoisyStarts.all,
-    belts: Annotated[int, typer.Option(min=1, help="Simulated belts for each method.")] = 1000,
+    belts: Annotated[int, _count("Simulated belts for each method.")] = 1000,
     seed: Seed = 0,
     report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-noisy-sorting"),
     as_json: Json = False,
@@ -389,9 +403,9 @@ def _run_noisy(
 @simulate.command("patrol")
 def simulate_patrol(
     instance: Instance = 2,
-    observability: Annotated[int, typer.Option(help="Percent of the patrol in view (100: everything).")] = 30,
-    sessions: Annotated[int, typer.Option(min=1, help="Trajectories per patroller.")] = 60,
-    steps: Annotated[int, typer.Option(min=1, help="Steps of a trajectory.")] = 5,
+    observability: Percent = None,
+    sessions: Annotated[int, _count("Trajectories per patroller.")] = 60,
+    steps: Annotated[int, _count("Steps of a trajectory.")] = 5,
     seed: Seed = 0,
 ) -> None:
     """Write what a learner sees of the patrollers, one trajectory a line, to standard output."""
@@ -423,18 +437,18 @@ def learn(
         Path, typer.Option(help="SQLite file that keeps every session; resumed if it exists.")
     ],
     observability: Annotated[
-        int | None, typer.Option(help="Percent in view, for the patrols; a file's in_view array otherwise.")
+        int | None, _count("Percent in view, for the patrols; a file's in_view array otherwise.", 0, 100)
     ] = None,
-    session_size: Annotated[int, typer.Option(min=1, help="Trajectories a session.")] = 1,
+    session_size: Annotated[int, _count("Trajectories a session.")] = 1,
     agent: Annotated[int | None, typer.Option(help="Learn from this agent's lines only.")] = None,
     statistic: Annotated[
         str, typer.Option(help="What is kept of a session: seen, counts or features.")
     ] = "seen",
     solver: Annotated[str, typer.Option(help="newton, ipopt, cvxpy or 'exponentiated gradient'.")] = "newton",
-    slack: Annotated[float | None, typer.Option(min=0, help="L1 slack, nats per trajectory.")] = None,
-    ridge: Annotated[float, typer.Option(min=0, help="Precision of a Gaussian prior on the weights.")] = 0.0,
+    slack: Annotated[float | None, _real("L1 slack, nats per trajectory.", 0)] = None,
+    ridge: Annotated[float, _real("Precision of a Gaussian prior on the weights.", 0)] = 0.0,
     follow: Annotated[bool, typer.Option("--follow", help="Keep waiting for new lines at the end.")] = False,
-    seed: Annotated[int, typer.Option(help="Seed of the first weights; ignored when resuming.")] = 0,
+    seed: Annotated[int, _seed("Seed of the first weights; ignored when resuming.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Learn online from a stream of trajectories; safe to interrupt, and to run again.
@@ -486,7 +500,7 @@ def learn(
 def show(
     journal: Annotated[Path, typer.Argument(help="A journal written by learn.")],
     export: Annotated[Path | None, typer.Option(help="Also write the history to this NetCDF file.")] = None,
-    last: Annotated[int, typer.Option(min=1, help="Sessions to list.")] = 10,
+    last: Annotated[int, _count("Sessions to list.")] = 10,
     as_json: Json = False,
 ) -> None:
     """Show what a journal holds; works while a learner is writing it."""
@@ -523,8 +537,7 @@ def _decision_process(name: str, observability: int | None) -> tuple[TabularMDP,
         from ..domains.patrol import instance
 
         patrol = instance(int(name[-1]))
-        degree = (30, 30, 18)[int(name[-1]) - 1] if observability is None else observability
-        return patrol.mdp, patrol.visibility(degree)
+        return patrol.mdp, patrol.visibility(observability)
     if observability is not None:
         raise ValueError("--observability is for the patrols; give an MDP file an in_view array instead")
     if name == "labyrinth":
@@ -559,6 +572,9 @@ def _reported_errors() -> Iterator[None]:
         if isinstance(error, OSError) and error.filename is not None:
             message = f"{error.filename}: {error.strerror}"
         _say(f"Error: {message}")
+        raise typer.Exit(1) from None
+    except MemoryError:
+        _say("Error: there is not enough memory for so much; ask for less")
         raise typer.Exit(1) from None
 
 

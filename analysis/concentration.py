@@ -20,6 +20,8 @@ from scipy.special import digamma, polygamma
 
 # Largest bet of the predictable intervals; Waudby-Smith and Ramdas (2023) recommend 1/2 or 3/4.
 _LARGEST_BET = 0.75
+# The squares of smaller errors, and the sizes that they ask for, leave the range of floats.
+_LEAST = 1e-60
 
 
 class Interval(NamedTuple):
@@ -190,6 +192,8 @@ def _log(delta: float) -> float:
 def _positive(name: str, x: float) -> float:
     if not (np.isfinite(x) and x > 0):
         raise ValueError(f"{name} must be positive, got {x}")
+    if x < _LEAST:
+        raise ValueError(f"{name} must be at least {_LEAST}, got {x}")
     return x
 
 

@@ -42,7 +42,6 @@ ONLINE, FORGETFUL, BATCH, RANDOM, TRUE = (
 )  # fmt: skip
 # Names on the command line.
 METHODS = {"lme-i2rl": ONLINE, "batch": BATCH, "random": RANDOM}
-DEFAULT_OBSERVABILITY = {1: 30, 2: 30, 3: 18}
 STEPS_PER_SESSION = 5
 
 Advance = Callable[[str, float | None], None]
@@ -122,7 +121,7 @@ def study(
     observability or method that does not exist.
     """
     patrol = instance(number)
-    observability = DEFAULT_OBSERVABILITY[number] if observability is None else observability
+    observability = patrol.observability if observability is None else observability
     view = patrol.visibility(observability)
     unknown = [m for m in methods or () if m not in METHODS]
     if unknown:

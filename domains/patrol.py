@@ -70,7 +70,7 @@ class Patrol(NamedTuple):
     ``mdp`` is the patrollers' process without the reward, ``weights`` the reward they really follow,
     ``views`` the learner's view at each degree of observability (percent, as the dissertation names it),
     ``breach`` the learner's own task (None in instance 1), ``loop`` the length of the patrollers' cycle in
-    steps.
+    steps, ``observability`` the degree of the dissertation's experiments.
     """
 
     name: str
@@ -81,6 +81,7 @@ class Patrol(NamedTuple):
     views: dict[int, Bool[np.ndarray, " S"]]
     breach: Breach | None
     loop: int
+    observability: int = 30
 
     @property
     def cells(self) -> tuple[Cell, ...]:
@@ -93,11 +94,13 @@ class Patrol(NamedTuple):
         index = {cell: i for i, cell in enumerate(self.cells)}
         return np.array([index[state.cell] for state in self.states])
 
-    def visibility(self, observability: int) -> Visibility:
+    def visibility(self, observability: int | None = None) -> Visibility:
         """The learner's view at an observability named by the dissertation (30, 70, 100 percent, ...).
 
-        Raises ``ValueError`` naming the degrees this instance has.
+        The default is the instance's own. Raises ``ValueError`` naming the degrees this instance has.
         """
+        if observability is None:
+            observability = self.observability
         if observability not in self.views:
             raise ValueError(f"{self.name} has no {observability} % view; it has {sorted(self.views)}")
         return Visibility(self.views[observability])
@@ -196,7 +199,7 @@ def _simulate(
 def demonstrate(
     key: Array,
     patrol: Patrol,
-    observability: int,
+    observability: int | None,
     sessions: int,
     steps: int = 5,
     interaction: Interaction = Interaction(),  # noqa: B008 (immutable)
@@ -204,7 +207,8 @@ def demonstrate(
     """What the learner perceives of each patroller: ``sessions`` consecutive windows of ``steps`` pairs.
 
     The patrollers start in states drawn from the MDP's initial distribution and follow their optimal
-    policies. Row ``i`` of each demonstration is session ``i`` (section 7.4.1: five pairs a session).
+    policies. Row ``i`` of each demonstration is session ``i`` (section 7.4.1: five pairs a session). An
+    ``observability`` of None is the instance's own.
     """
     policy = jnp.log(jnp.asarray(patrol.expert_policy()))
     first, walk, look = jax.random.split(key, 3)
@@ -236,6 +240,7 @@ def _build(
     views: dict[int, Callable[[State], bool]],
     breach: Breach | None,
     loop: int,
+    observability: int = 30,
 ) -> Patrol:
     index = {state: i for i, state in enumerate(states)}
     shape = (len(states), len(ACTIONS))
@@ -260,7 +265,7 @@ def _build(
         feature_names=feature_names,
     )
     masks = {percent: np.array([rule(s) for s in states]) for percent, rule in views.items()}
-    return Patrol(name, mdp, np.array(weights), states, patrollers, masks, breach, loop)
+    return Patrol(name, mdp, np.array(weights), states, patrollers, masks, breach, loop, observability)
 
 
 def _ahead(state: State) -> Cell:
@@ -418,7 +423,7 @@ def boyd_with_rooms() -> Patrol:
         breach=Breach(
             tuple(sorted(cells | {(0, 17), (1, 0), (13, 13)})), State(0, 17, 2), ((1, 0), (13, 13)), 0.95
         ),
-        loop=64,
+        loop=64, observability=18,
     )  # fmt: skip
 
 

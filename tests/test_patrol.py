@@ -403,3 +403,9 @@ def test_demonstrations_are_reproducible_by_key():
     for a, b, c in zip(one, same, other, strict=True):
         assert np.array_equal(a.codes, b.codes)
         assert not np.array_equal(a.codes, c.codes)
+
+
+def test_each_instance_is_viewed_at_its_own_observability():
+    for patrol, degree in ((instance(1), 30), (instance(2), 30), (instance(3), 18)):
+        assert patrol.observability == degree
+        np.testing.assert_array_equal(patrol.visibility().in_view, patrol.views[degree])
