@@ -19,6 +19,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..models.archives import StorageError
+from ..models.text import parsed_json, shortened
 from .adversarial_metrics import (
     Correlation,
     EmpiricalILE,
@@ -270,11 +272,19 @@ def store_results(results: AdversarialResults, path: Path | str) -> None:
 
 
 def load_results(path: Path | str) -> AdversarialResults:
-    """Read what :func:`store_results` wrote; ``ValueError`` for a file of something else."""
-    found = rebuilt(json.loads(Path(path).read_text()))
+    """Read what :func:`store_results` wrote; :class:`StorageError` for a file of something else."""
+    found = read_plain(path)
     if not isinstance(found, AdversarialResults):
-        raise ValueError(f"{path} does not hold the results of adversarial learners")
+        raise StorageError(f"{path}: the file does not hold the results of adversarial learners")
     return found
+
+
+def read_plain(path: Path | str) -> Any:
+    """Read JSON of :func:`plain`; :class:`StorageError` naming the file if it is damaged."""
+    try:
+        return rebuilt(parsed_json(Path(path).read_text(encoding="utf-8")))
+    except (ValueError, TypeError, KeyError, AttributeError, OverflowError, RecursionError) as error:
+        raise StorageError(f"{path}: not stored results: {shortened(str(error), 200)[1:-1]}") from None
 
 
 def plain(value: Any) -> Any:
@@ -309,5 +319,5 @@ def rebuilt(value: Any) -> Any:
         return float(value["float"])
     kind = _KINDS.get(value.get("kind", ""))
     if kind is None:
-        raise ValueError(f"there is nothing of the kind {value.get('kind')!r} in results")
+        raise ValueError(f"there is nothing of the kind {shortened(value.get('kind'))} in results")
     return kind(**{k: rebuilt(v) for k, v in value.items() if k != "kind"})

@@ -33,6 +33,7 @@ from ..inference.ppo import ppo
 from ..inference.session import Learner
 from ..inference.snippet_regression import Regression
 from ..inference.ssrr import SSRRTraining, ssrr
+from ..models.archives import StorageError
 from ..models.sensing import Recording, distort
 from .adversarial_cases import Case, Plan, case
 from .adversarial_metrics import EmpiricalILE, bounded_ile, returns_at_fixed_length
@@ -50,7 +51,7 @@ from .adversarial_results import (
     belief_from_draws,
     frame_strip,
     plain,
-    rebuilt,
+    read_plain,
     reward_scatter,
 )
 
@@ -347,8 +348,14 @@ def _kept(name: str, method: str, seed: int, plan: Plan, folder: Path | None) ->
         return run(name, method, seed, plan)
     path = Path(folder) / name / f"{plan.digest}-{method.replace(' ', '_').replace(',', '')}-{seed}.json"
     if path.exists():
-        return Outcome(**rebuilt(json.loads(path.read_text())))
+        fields = read_plain(path)
+        if not isinstance(fields, dict) or fields.keys() != set(Outcome._fields):
+            raise StorageError(f"{path}: the file does not hold a finished run; delete it to run again")
+        return Outcome(**fields)
     outcome = run(name, method, seed, plan)
     path.parent.mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(plain(outcome._asdict())))
+    # In one step: a run that is interrupted must not leave half a file, which would be found again.
+    part = path.with_suffix(".part")
+    part.write_text(json.dumps(plain(outcome._asdict())))
+    part.replace(path)
     return outcome

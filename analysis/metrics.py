@@ -25,6 +25,7 @@ from ..models.planning import (
     reward_of,
     soft_plan,
 )
+from ..models.text import shortened
 
 
 class Accuracy(NamedTuple):
@@ -149,7 +150,9 @@ def _checked(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, " K"]
     # A learner that failed must not be scored by whatever argmax makes of NaN.
     if not isinstance(weights, jax.core.Tracer) and not np.isfinite(weights).all():
         k = int(np.flatnonzero(~np.isfinite(weights))[0])
-        raise ValueError(f"the weight of feature {mdp.feature_names[k]!r} is {weights[k]}, not a number")
+        raise ValueError(
+            f"the weight of feature {shortened(mdp.feature_names[k])} is {weights[k]}, not a number"
+        )
     return weights
 
 

@@ -22,6 +22,7 @@ from ..models.planning import (
     require_discounted,
     reward_of,
 )
+from ..models.text import shortened
 
 
 def expected_value_difference(
@@ -159,8 +160,8 @@ def _weights(mdp: TabularMDP, which: str, weights: Float[np.ndarray, "D K"]) -> 
     if not np.isfinite(weights).all():
         way, k = np.argwhere(~np.isfinite(weights))[0]
         raise ValueError(
-            f"the {which} weight of feature {mdp.feature_names[k]!r} in way {way} is {weights[way, k]}, "
-            "not a number"
+            f"the {which} weight of feature {shortened(mdp.feature_names[k])} in way {way} is "
+            f"{weights[way, k]}, not a number"
         )
     return weights
 

@@ -27,6 +27,7 @@ from ..inference.posterior import sample_posterior
 from ..models.demonstration import LOST, PAD, Demonstration
 from ..models.evidence import Imperfection
 from ..models.mdp import Labels, TabularMDP
+from ..models.text import listed, shortened
 
 # Above this the importance weights of a trajectory left out are too uneven to be relied on.
 PARETO_LIMIT = 0.7
@@ -87,9 +88,9 @@ def select_features(mdp: TabularMDP, names: Sequence[str]) -> TabularMDP:
         raise ValueError("select at least one feature")
     for name in names:
         if name not in mdp.feature_names:
-            raise ValueError(f"unknown feature {name!r}; known are {', '.join(mdp.feature_names)}")
+            raise ValueError(f"unknown feature {shortened(name)}; known are {listed(mdp.feature_names)}")
     if len(set(names)) != len(names):
-        raise ValueError(f"features must differ, got {', '.join(names)}")
+        raise ValueError(f"features must differ, got {listed(names)}")
     columns = np.array([mdp.feature_names.index(name) for name in names])
     labels = Labels(mdp.labels.states, mdp.labels.actions, tuple(names))
     return replace(mdp, features=jnp.asarray(mdp.features)[..., columns], labels=labels)

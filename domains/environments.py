@@ -32,6 +32,7 @@ from gymnasium.spaces import Discrete
 from jaxtyping import UInt8
 
 from ..models.mdp import TabularMDP
+from ..models.text import listed, shortened
 from .labyrinth import WATER_PORT, labyrinth
 from .object_world import object_world
 from .patrol import instance
@@ -127,10 +128,11 @@ class TabularEnv(gymnasium.Env[int, int]):
     def _state_given(self, state: int | str) -> int:
         if isinstance(state, str):
             if state not in self.mdp.state_names:
-                raise ValueError(f"there is no state named {state!r}; one is {self.mdp.state_names[0]!r}")
+                first = shortened(self.mdp.state_names[0])
+                raise ValueError(f"there is no state named {shortened(state)}; one is {first}")
             return self.mdp.state_names.index(state)
         if not isinstance(state, int | np.integer) or not 0 <= state < self.mdp.n_states:
-            raise ValueError(f"states are 0 to {self.mdp.n_states - 1} or a name, got {state!r}")
+            raise ValueError(f"states are 0 to {self.mdp.n_states - 1} or a name, got {shortened(state)}")
         return int(state)
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
@@ -142,14 +144,14 @@ class TabularEnv(gymnasium.Env[int, int]):
         if self._state is None:
             raise gymnasium.error.ResetNeeded("reset the environment before the first step")
         if not self.action_space.contains(action):
-            raise ValueError(f"actions are 0 to {self.mdp.n_actions - 1}, got {action!r}")
+            raise ValueError(f"actions are 0 to {self.mdp.n_actions - 1}, got {shortened(action)}")
         state, action = self._state, int(action)
         offered = bool(self._mask[state, action])
         if not offered and self.strict:
             names = [self.mdp.action_names[a] for a in np.flatnonzero(self._mask[state])]
             raise ValueError(
-                f"state {self.mdp.state_names[state]!r} ({state}) does not offer "
-                f"{self.mdp.action_names[action]!r} ({action}); it offers {', '.join(names)}"
+                f"state {shortened(self.mdp.state_names[state])} ({state}) does not offer "
+                f"{shortened(self.mdp.action_names[action])} ({action}); it offers {listed(names, 12)}"
             )
         if offered:
             branch = _drawn(self._cumulative[state, action], self.np_random.random())

@@ -13,7 +13,6 @@ pair, and deterministic moves named after where they lead: ``back`` to the paren
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cache, partial
 from itertools import pairwise
@@ -271,7 +270,7 @@ def _check_frames(frames: Any, n_nodes: int, where: str) -> None:
             f"{where}: frames must be a list of one number per node ({n_nodes}), got {given}"
         )
     for t, frame in enumerate(frames):
-        if isinstance(frame, bool) or not isinstance(frame, int | float) or not abs(frame) < math.inf:
+        if isinstance(frame, bool) or not isinstance(frame, int | float) or not abs(frame) < 2**63:
             raise DemonstrationError(f"{where}, frames[{t}]: a frame is a number, got {shortened(frame)}")
         if t and frame < frames[t - 1]:
             raise DemonstrationError(

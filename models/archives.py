@@ -20,6 +20,7 @@ MAX_BYTES = 2**30
 _MAX_HEADER = 4096
 _MAX_DIMENSIONS = 8
 _CHUNK = 2**16
+_LAST_CHARACTER = 0x10FFFF
 # ZipFile reads the list of an archive's entries in one piece; every other piece is a chunk at most.
 _MAX_PIECE = 2**20
 _ENCRYPTED = 0x1
@@ -188,6 +189,8 @@ def _array(archive: zipfile.ZipFile, name: str, entry: zipfile.ZipInfo, header: 
             at += len(piece)
     if header.dtype.kind == "b" and (flat.view(np.uint8) > 1).any():
         raise StorageError(f"the array {name!r} must hold booleans; it has bytes that are neither 0 nor 1")
+    if header.dtype.kind == "U" and flat.view(header.dtype.byteorder + "u4").max() > _LAST_CHARACTER:
+        raise StorageError(f"the array {name!r} must hold text; it has numbers that are no characters")
     return flat.reshape(header.shape, order="F" if header.fortran_order else "C")
 
 

@@ -173,11 +173,12 @@ class TabularMDP:
         initial = _real("initial", start)
         if initial.shape != (n_states,):
             raise ValueError(f"initial must have shape [{n_states}], got {initial.shape}")
-        within = sum_tolerance(start.dtype, n_states)
-        if not np.isfinite(initial).all() or (initial < 0).any() or abs(initial.sum() - 1) > within:
+        with np.errstate(over="ignore"):
+            total, within = initial.sum(), sum_tolerance(start.dtype, n_states)
+        if not np.isfinite(initial).all() or (initial < 0).any() or abs(total - 1) > within:
             raise ValueError(
                 f"initial must be a distribution over states: its least value is {initial.min()}, "
-                f"its sum {initial.sum()}"
+                f"its sum {total}"
             )
         # Unavailable pairs lead nowhere: they keep their place with zero probability and zero features.
         probabilities = np.where(available[..., None], probabilities, 0.0)
@@ -422,7 +423,8 @@ def _check_transitions(
         raise ValueError(
             f"a transition probability of {name.pair(s, a)} is negative: {probabilities[s, a, b]}"
         )
-    total = probabilities.sum(-1)
+    with np.errstate(over="ignore"):
+        total = probabilities.sum(-1)
     wrong = available & (np.abs(total - 1) > tolerance)
     if wrong.any():
         s, a = np.argwhere(wrong)[0]

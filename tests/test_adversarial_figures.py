@@ -44,7 +44,7 @@ from i2rl.analysis.adversarial_results import (
 from i2rl.analysis.noisy_examples import Strip
 from i2rl.analysis.style import DARK, LIGHT
 from i2rl.domains.locomotion import locomotion
-from i2rl.models import Demonstration
+from i2rl.models import Demonstration, StorageError
 
 LEVELS = {CLEAN: 2000.0, NOISY: 600.0, ROBUST: 1800.0, SSRR: 1500.0}
 PAIRS = np.arange(1, 9) * 32
@@ -336,6 +336,21 @@ def test_results_are_read_as_they_were_stored(hopper, patrol, tmp_path):
     (tmp_path / "other.json").write_text("[1, 2]")
     with pytest.raises(ValueError, match="does not hold the results"):
         load_results(tmp_path / "other.json")
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "[" * 10**5, "1" * 5000, '{"kind": "Interval"}', '{"items": [[[], 1]]}', '{"items": 3}', "\xff",
+        '{"array": [1, 2], "shape": [1099511627776]}', '{"float": "x"}', '{"a": 1, "a": 2}', "{}",
+    ],
+    ids=range(11),
+)  # fmt: skip
+def test_damaged_results_are_refused_by_file(text, tmp_path):
+    (tmp_path / "other.json").write_text(text, encoding="latin-1")
+    with pytest.raises(StorageError, match=r"other\.json: not stored results: ") as caught:
+        load_results(tmp_path / "other.json")
+    assert len(str(caught.value)) < 400
 
 
 def test_the_report_holds_everything(hopper, patrol, tmp_path):

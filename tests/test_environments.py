@@ -105,7 +105,7 @@ def test_what_a_state_does_not_offer_changes_nothing_or_is_refused():
     assert info["available"] is False
     strict = _tabular("i2rl/SortingWithClaiming-v0", strict=True)
     state, _ = strict.reset(seed=0)
-    with pytest.raises(ValueError, match=r"does not offer .*; it offers pick"):
+    with pytest.raises(ValueError, match=r"does not offer .*; it offers 'pick'"):
         strict.step(absent)
 
 

@@ -147,7 +147,7 @@ def test_selected_features_are_the_same_numbers(ring):
     np.testing.assert_array_equal(both.features, ring.features[..., ::-1])
     again = with_features(ring, np.asarray(ring.features), ring.feature_names)
     assert again.fingerprint() == ring.fingerprint()
-    with pytest.raises(ValueError, match="unknown feature 'away'; known are home, turned"):
+    with pytest.raises(ValueError, match="unknown feature 'away'; known are 'home', 'turned'"):
         select_features(ring, ["away"])
     with pytest.raises(ValueError, match="must differ"):
         select_features(ring, ["home", "home"])
