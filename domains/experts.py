@@ -172,8 +172,8 @@ def load_demonstrations(name: str) -> Demonstrations:
     arrays = read_arrays(path, _EPISODES, required=tuple(_EPISODES), what="archive of demonstrations")
     episodes = Demonstrations(**arrays)
     rows = episodes.rewards.shape
-    for field, array, rank in zip(_EPISODES, episodes, (3, (2, 3), 2, 1, 1), strict=True):
-        if array.ndim not in np.atleast_1d(rank) or array.shape[:2] != rows[: array.ndim]:
+    for field, array, ranks in zip(_EPISODES, episodes, ((3,), (2, 3), (2,), (1,), (1,)), strict=True):
+        if array.ndim not in ranks or array.shape[:2] != rows[: array.ndim]:
             raise StorageError(
                 f"{path}: the array {field!r} of shape {array.shape} does not fit rewards [n, L] of {rows}"
             )

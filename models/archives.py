@@ -22,7 +22,7 @@ _MAX_DIMENSIONS = 8
 _CHUNK = 2**16
 _LAST_CHARACTER = 0x10FFFF
 # ZipFile reads the list of an archive's entries in one piece; every other piece is a chunk at most.
-_MAX_PIECE = 2**20
+_MAX_PIECE = 2**17
 _ENCRYPTED = 0x1
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _WORDS = {"b": "booleans", "i": "integers", "u": "integers", "f": "real numbers", "U": "text", "S": "bytes",
@@ -84,7 +84,7 @@ def read_arrays(
     """
     with open(path, "rb") as file:
         try:
-            with zipfile.ZipFile(_Pieces(file)) as archive:  # type: ignore[arg-type]
+            with zipfile.ZipFile(_Pieces(file)) as archive:
                 entries = _entries(archive, kinds, required, what, max_bytes)
                 headers = {name: _header(archive, name, entries[name], kinds[name]) for name in entries}
                 return {name: _array(archive, name, entries[name], headers[name]) for name in entries}
@@ -178,16 +178,16 @@ def _description(name: str, text: str) -> tuple[np.dtype, bool, tuple[int, ...]]
 
 def _array(archive: zipfile.ZipFile, name: str, entry: zipfile.ZipInfo, header: _Header) -> np.ndarray:
     flat = np.empty(header.n_elements, header.dtype)
-    content, at = memoryview(flat.view(np.uint8)), 0
+    content, at = flat.view(np.uint8), 0
     with archive.open(entry) as stream:
         _exactly(stream, header.begin, name)
         while at < len(content):
             piece = stream.read(min(_CHUNK, len(content) - at))
             if not piece:
                 raise StorageError(f"the array {name!r} ends after {at} of {len(content)} bytes")
-            content[at : at + len(piece)] = piece
+            content[at : at + len(piece)] = np.frombuffer(piece, np.uint8)
             at += len(piece)
-    if header.dtype.kind == "b" and (flat.view(np.uint8) > 1).any():
+    if header.dtype.kind == "b" and content.max() > 1:
         raise StorageError(f"the array {name!r} must hold booleans; it has bytes that are neither 0 nor 1")
     if header.dtype.kind == "U" and flat.view(header.dtype.byteorder + "u4").max() > _LAST_CHARACTER:
         raise StorageError(f"the array {name!r} must hold text; it has numbers that are no characters")

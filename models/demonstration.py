@@ -610,9 +610,10 @@ def write_trajectories(
         if not total:
             continue
         steps = []
-        for t, values in enumerate(zip(*(x[i, :total].tolist() for x in arrays), strict=True)):
+        columns = (x[i, :total].tolist() for x in arrays)
+        for t, (kind, state, action, score) in enumerate(zip(*columns, strict=True)):
             try:
-                steps.append(_written(*values, names, mdp))
+                steps.append(_written(kind, state, action, score, names, mdp))
             except DemonstrationError as error:
                 raise DemonstrationError(f"trajectory {i}, step {t}: {error}") from None
         record = {field: entries[i] for field, entries in extra.items() if entries is not None}

@@ -58,9 +58,9 @@ def load_mdp(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Sto
     """Read what :func:`save_mdp` wrote, or an archive made by other means with the same arrays.
 
     Only ``successors``, ``probabilities`` and ``features`` are required. The arrays are checked by their
-    headers before they are read, and may take ``max_bytes`` in all (1 GiB by default). Raises
-    :class:`StorageError` (a ``ValueError``) naming the file and what is wrong with it, ``OSError`` if it
-    cannot be opened.
+    headers before they are read, and may take ``max_bytes`` in all (1 GiB by default); building the process
+    takes about three times their size. Raises :class:`StorageError` (a ``ValueError``) naming the file and
+    what is wrong with it, ``OSError`` if it cannot be opened.
     """
     arrays = read_arrays(path, _KINDS, required=_ARRAYS[:3], what="MDP archive", max_bytes=max_bytes)
     try:

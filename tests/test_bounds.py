@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from i2rl.analysis.assumptions import BoundNotGuaranteed
 from i2rl.analysis.bounds import (
+    demonstrations_needed,
     error_for,
     failure_probability,
     lme_constraint_bound,
@@ -188,6 +189,11 @@ def test_a_confidence_outside_zero_and_one_is_refused(confidence):
 def test_errors_sizes_and_discounts_out_of_range_are_refused():
     with pytest.raises(ValueError, match=r"error must be positive, got -0\.1"):
         size_for(-0.1, 0.1, 6)
+    for error in (1e-300, 1e-61):  # their squares, and the sizes they ask for, leave the range of floats
+        with pytest.raises(ValueError, match=f"error must be at least 1e-60, got {error}"):
+            size_for(error, 0.1, 6)
+        with pytest.raises(ValueError, match=f"epsilon must be at least 1e-60, got {error}"):
+            demonstrations_needed(6, error, 0.8)
     with pytest.raises(ValueError, match="delta must lie strictly between 0 and 1, got 2"):
         size_for(0.1, 2.0, 6)
     with pytest.raises(ValueError, match=r"discount must lie in \[0, 1\), got 1"):

@@ -153,6 +153,9 @@ def test_an_error_that_is_not_positive_is_refused():
     ):
         with pytest.raises(ValueError, match="error must be positive, got 0"):
             size(0.0, 0.1)
+        with pytest.raises(ValueError, match="error must be at least 1e-60, got 1e-300"):
+            size(1e-300, 0.1)
+        assert size(1e-60, 0.1) > 1e100
 
 
 def test_one_value_has_no_variance():

@@ -1,4 +1,5 @@
 import operator
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -22,6 +23,7 @@ from i2rl.models import (
     soft_plan,
 )
 from i2rl.models.demonstration import UNKNOWN
+from i2rl.models.mdp import Labels
 
 
 @jax.jit
@@ -245,3 +247,14 @@ def test_what_makes_no_sense_is_refused(world, random_mdp):
         ending_at(world, np.zeros(6, bool))
     with pytest.raises(ValueError, match="boolean array"):
         list(goal_sessions([], np.arange(6)))
+
+
+def test_an_end_among_states_of_that_name_gets_another(world):
+    goals = np.arange(6) == 2
+    for names, added in (
+        (("a", "b", "c", "d", "e", "f"), "end"),
+        (("end", "b", "c", "end 2", "e", "f"), "end 3"),
+    ):
+        named = replace(world, labels=Labels(names, None, None))
+        assert ending_at(named, goals).state_names == (*names, added)
+    assert ending_at(world, goals).state_names[-1] == "s6"

@@ -224,7 +224,7 @@ def _check_facts(states, actions):
 def _change(path, row, column, value):
     lines = [line.split(",") for line in path.read_text().splitlines()]
     lines[row - 1][column - 1] = value
-    path.write_text("\n".join(map(",".join, lines)) + "\n")
+    path.write_text("\n".join(map(",".join, lines)) + "\n", errors="surrogateescape")
 
 
 @pytest.mark.parametrize(
@@ -232,6 +232,11 @@ def _change(path, row, column, value):
     [
         ("states", 4, 7, "wrist", r"states_2.csv, row 4, column 7: 'wrist' is not a finite number"),
         ("states", 1, 1, "nan", r"states_2.csv, row 1, column 1: 'nan' is not a finite number"),
+        ("states", 3, 3, "1_0", r"states_2.csv, row 3, column 3: '1_0' is not a finite number"),
+        ("states", 3, 3, "1e999", r"states_2.csv, row 3, column 3: '1e999' is not a finite number"),
+        ("states", 3, 3, "x" * 2000, r"states_2.csv, row 3, column 3: 'x+\.\.\.x+' is not a finite number"),
+        ("states", 3, 3, "0" * 5000, r"states_2.csv, row 3: a row must have at most 4096 characters"),
+        ("states", 3, 3, "\udcff", r"states_2.csv, row 3: not UTF-8 text at byte"),
         ("actions", 3, 3, "", r"actions_2.csv, row 3, column 3: '' is not a finite number"),
         ("states", 5, 2, "0.1,0.2", r"states_2.csv, row 5: 30 columns, expected 29"),
         ("states", 6, 17, "0.5", r"states_2.csv, row 6, column 17: the label is 0.5; expected 1"),
