@@ -15,8 +15,8 @@ process ends, however it ends; the empty lock file stays behind.
 
 How damage is noticed. Every session holds a digest of itself and of the session before it, the first one of
 the journal's origin; the state holds the newest digest and the number of sessions. Opening compares the state,
-the newest session and the number of sessions; reading a session compares it with those beside it;
-:meth:`JournalView.verify` compares everything. The digests are no signatures: they reveal accidents, and not
+the newest session (for writing the newest 1,000) and the number of sessions; reading a session compares it with
+those beside it; :meth:`JournalView.verify` compares everything. The digests are no signatures: they reveal accidents, and not
 somebody who computes them anew.
 
 Versions. Journals of version 1 have no digests. :meth:`Journal.open` adds them, taking what is there as true;
@@ -55,6 +55,9 @@ APPLICATION_ID = int.from_bytes(b"i2rl", "big")
 SCHEMA_VERSION = 2
 SESSION_BYTES = 1 << 26
 """The most that weights, report or origin may take: nothing larger is read into memory, or written."""
+
+RECENT = 1000
+"""Sessions that are compared with their digests when a journal is opened for writing."""
 
 _MAGIC = b"SQLite format 3\0"
 
@@ -574,6 +577,8 @@ class Journal(JournalView):
                         f"{path} is a journal of {view.origin}, but this learner is {origin}; "
                         f"what differs: {difference}"
                     )
+                for _ in view._verified(last=RECENT):
+                    pass
                 state = _restored_state(view, learner)
                 # Not before here, so that a journal that is refused stays as it was.
                 _require_alone(connection, lock)

@@ -36,10 +36,13 @@ def connect(path: Path, mode: str, timeout: float = 10.0) -> sqlite3.Connection:
 
 @contextmanager
 def explained(path: Path, doing: str) -> Iterator[None]:
-    """Turn SQLite's errors into :class:`JournalError`: ``path`` cannot ``doing``, and why."""
+    """Turn SQLite's errors into :class:`JournalError`: ``path`` cannot ``doing``, and why.
+
+    A damaged file also makes SQLite ask for more memory than there is, or quote what is no text.
+    """
     try:
         yield
-    except (sqlite3.Error, OSError, OverflowError) as error:
+    except (sqlite3.Error, OSError, OverflowError, MemoryError, UnicodeDecodeError) as error:
         raise JournalError(f"{path} cannot {doing}: {error}") from error
 
 

@@ -18,6 +18,7 @@ import math
 import struct
 from collections.abc import Mapping
 from contextlib import suppress
+from functools import lru_cache
 from typing import Any, NamedTuple
 
 import jax
@@ -31,6 +32,7 @@ MOST_LEAVES = 20_000
 
 _MAGIC = b"i2rltree"
 _LONGEST_HEADER = 1 << 22
+_CACHED = 1 << 14
 _LARGEST_SIDE = 1 << 40
 _MOST_AXES = 32
 _KEY = "key:"
@@ -103,19 +105,17 @@ def decode(blob: bytes) -> dict[str, Leaf]:
     if len(body) < start or body[: len(_MAGIC)] != _MAGIC or _checksum(body) != digest:
         raise ValueError("the bytes are damaged (their checksum is wrong)")
     offset = start + struct.unpack_from("<I", body, len(_MAGIC))[0]
+    header = bytes(body[start : min(offset, start + _LONGEST_HEADER + 1)])
     leaves = {}
-    for entry in _header(bytes(body[start : min(offset, start + _LONGEST_HEADER + 1)])):
-        name, kind, dtype, shape = _described(entry, leaves)
-        count = math.prod(shape)
-        end = offset + count * dtype.itemsize
-        if end > len(body):
-            raise ValueError(f"the bytes are damaged ({shortened(name)} has more elements than there are bytes)")
+    for name, kind, dtype, shape, size in (_cached_header if len(header) < _CACHED else _header)(header):
+        if offset + size > len(body):
+            raise ValueError(f"the bytes are damaged ({shortened(name)} needs more of them than there are)")
         stored = np.empty(shape, dtype)  # aligned, writable, and free of the blob
-        stored.reshape(-1).view(np.uint8)[:] = np.frombuffer(body[offset:end], np.uint8)
+        stored.reshape(-1).view(np.uint8)[:] = np.frombuffer(body, np.uint8, size, offset)
         leaves[name] = Leaf(kind, stored)
-        offset = end
+        offset += size
     if offset != len(body):
-        raise ValueError(f"the bytes are damaged ({len(body) - offset:,} bytes belong to no leaf)")
+        raise ValueError(f"the bytes are damaged ({len(body) - offset:,} of them belong to no leaf)")
     return leaves
 
 
@@ -144,7 +144,18 @@ def _trimmed(demonstration: Demonstration) -> Demonstration:
     return Demonstration(*(x[rows, :width] for x in (*arrays[:3], np.where(np.isnan(score), np.nan, arrays[3]))))
 
 
-def _header(text: bytes) -> list[Any]:
+class _Description(NamedTuple):
+    """A leaf as a header describes it, and its size in bytes."""
+
+    name: str
+    kind: str
+    dtype: np.dtype
+    shape: tuple[int, ...]
+    size: int
+
+
+def _header(text: bytes) -> list[_Description]:
+    """The leaves of a header, once every entry makes sense."""
     if len(text) > _LONGEST_HEADER:
         raise ValueError(f"the bytes are damaged (their header is longer than {_LONGEST_HEADER:,} bytes)")
     try:
@@ -153,32 +164,40 @@ def _header(text: bytes) -> list[Any]:
         raise ValueError("the bytes are damaged (their header is not JSON)") from None
     if not isinstance(entries, list) or len(entries) > MOST_LEAVES:
         raise ValueError(f"the bytes are damaged (their header is no list of up to {MOST_LEAVES:,} leaves)")
-    return entries
+    described = []
+    for entry in entries:
+        leaf = _described(entry)
+        if leaf is None:
+            raise ValueError(f"the bytes are damaged (a leaf is described by {shortened(entry)})")
+        described.append(leaf)
+    if len({leaf.name for leaf in described}) < len(described):
+        raise ValueError("the bytes are damaged (two leaves have one name)")
+    return described
 
 
-def _described(entry: Any, before: Mapping[str, Leaf]) -> tuple[str, str, np.dtype, tuple[int, ...]]:
-    """Name, kind, type and shape that a header's entry states, once they make sense."""
-    damaged = ValueError(f"the bytes are damaged (a leaf is described by {shortened(entry)})")
-    if not isinstance(entry, list) or len(entry) != 4:
-        raise damaged
+# Sessions of one learner have one header; reading it is most of the work.
+_cached_header = lru_cache(maxsize=64)(_header)
+
+
+def _described(entry: Any) -> _Description | None:
+    if not isinstance(entry, list) or len(entry) != 4 or not all(isinstance(x, str) for x in entry[:3]):
+        return None
     name, kind, dtype_name, shape = entry
-    if not (isinstance(name, str) and isinstance(kind, str) and isinstance(dtype_name, str)) or name in before:
-        raise damaged
     if kind not in _KINDS and not kind.startswith(_KEY):
-        raise damaged
-    if not isinstance(shape, list) or len(shape) > _MOST_AXES:
-        raise damaged
+        return None
+    if not isinstance(shape, list) or len(shape) > _MOST_AXES or len(shape) != _axes(kind, len(shape)):
+        return None
     if not all(type(side) is int and 0 <= side < _LARGEST_SIDE for side in shape):
-        raise damaged
+        return None
     try:
         dtype = np.dtype(dtype_name)
     except (TypeError, ValueError, SyntaxError):
-        raise damaged from None
-    if _dtype_name(dtype) != dtype_name or not dtype.itemsize or len(shape) != _axes(kind, len(shape)):
-        raise damaged
+        return None
+    if not dtype.itemsize or _dtype_name(dtype) != dtype_name:
+        return None
     if kind in ("none", "text") and dtype != np.uint8 or kind == "none" and shape != [0]:
-        raise damaged
-    return name, kind, dtype, tuple(shape)
+        return None
+    return _Description(name, kind, dtype, tuple(shape), math.prod(shape) * dtype.itemsize)
 
 
 def _axes(kind: str, given: int) -> int:

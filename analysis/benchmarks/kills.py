@@ -29,7 +29,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -124,11 +124,12 @@ def content(path: Path) -> Content:
             )
             for record in view.reports()
         ]
-    connection = sqlite3.connect(path)
-    try:
-        return Content(sessions, connection.execute("SELECT session, tree FROM state").fetchall())
-    finally:
-        connection.close()
+        state = [(name, str(value.dtype), value.tobytes()) for name, value in _arrays(view.stored_state())]
+        return Content(sessions, [(view.session, state)] if state else [])
+
+
+def _arrays(leaves: Mapping[str, Any]) -> Iterator[tuple[str, np.ndarray]]:
+    return ((name, np.asarray("" if value is None else value)) for name, value in leaves.items())
 
 
 def run_until(command: Sequence[str], environment: Mapping[str, str], instant: Instant) -> Ended:
