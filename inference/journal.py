@@ -110,28 +110,6 @@ class Position(NamedTuple):
         content = bytes.fromhex(self.digest) + line.rstrip("\r\n").encode("utf-8", "surrogatepass")
         return Position(self.records + 1, hashlib.sha256(content).hexdigest())
 
-    def unread(self, lines: Iterable[str]) -> Iterator[str]:
-        """The lines not consumed yet.
-
-        Raises :class:`JournalError`, before the first of them, where the earlier lines are not those that
-        were consumed.
-        """
-        lines = iter(lines)
-        here = Position()
-        while here.records < self.records:
-            line = next(lines, None)
-            if line is None:
-                raise JournalError(
-                    f"the input ends after {here.records} lines, but {self.records} were already learned from"
-                )
-            here = here.after(line)
-        if self.digest and here.digest != self.digest:
-            raise JournalError(
-                f"the first {self.records} lines of the input are not those that were learned from; "
-                "to learn from another input, start another journal"
-            )
-        yield from lines
-
 
 class SessionRecord(NamedTuple):
     """One committed session.
@@ -328,8 +306,7 @@ class JournalView:
     @property
     def position(self) -> Position:
         """The input consumed by the last committed session."""
-        newest = self._rows("ORDER BY number DESC LIMIT 1")
-        return newest[0].position if newest else Position()
+        return self.position_after(self.session) or Position()
 
     def reports(self, last: int | None = None) -> Iterator[SessionRecord]:
         """Committed sessions, in order: all of them, or the ``last`` few, of which no others are read.
@@ -338,6 +315,16 @@ class JournalView:
         """
         for row in self._verified(last):
             yield self._record(row)
+
+    @property
+    def sessions(self) -> int:
+        """How many sessions are in the journal: less than :attr:`session` where one could not be committed."""
+        return self._state().sessions
+
+    def position_after(self, session: int) -> Position | None:
+        """The input consumed by a session; None if there is no such session."""
+        found = self._rows("WHERE number = ?", session)
+        return found[0].position if found else None
 
     def demonstration(self, session: int) -> bytes:
         """Digest of what a session learned from; empty if unknown, or if there is no such session."""

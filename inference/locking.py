@@ -56,8 +56,8 @@ class Identity(NamedTuple):
     number: int
 
     @staticmethod
-    def of(path: Path) -> Identity | None:
-        """The identity of the file now at this path; None where there is none."""
+    def of(path: Path | str | int) -> Identity | None:
+        """The identity of an open file, or of the file now at a path; None where there is none."""
         try:
             found = os.stat(path)
         except FileNotFoundError:
