@@ -42,7 +42,7 @@ DEFAULT_LIMITS = Limits()
 # -- lines ------------------------------------------------------------------------------------------------
 
 
-def follow(path: str, say: Callable[[str], None], poll_seconds: float = 0.2) -> Iterator[bytes]:
+def followed(path: str, say: Callable[[str], None], poll_seconds: float = 0.2) -> Iterator[bytes]:
     """Pieces of lines of a file that is still being written; never ends by itself.
 
     A file that is replaced (rotated) is read to its end, and then the new one from its start. A file that is
@@ -140,7 +140,7 @@ class _Unfinished:
 
 def open_lines(
     path: str,
-    follow_file: bool,
+    follow: bool,
     limits: Limits = DEFAULT_LIMITS,
     *,
     skip: bool = False,
@@ -156,7 +156,7 @@ def open_lines(
     else:
         source = os.path.basename(path)
         file = open(path, "rb")  # noqa: SIM115 (read to the end of the process)
-        pieces = follow(path, say) if follow_file else iter(partial(file.readline, _PIECE), b"")
+        pieces = followed(path, say) if follow else iter(partial(file.readline, _PIECE), b"")
     return read_lines(pieces, source, limits, skip=skip), source
 
 

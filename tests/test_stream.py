@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from i2rl.analysis.benchmarks.kills import content, survive
-from i2rl.analysis.stream import follow_lines, learn_stream, open_lines
+from i2rl.analysis.stream import followed, learn_stream, open_lines
 from i2rl.inference.journal import Journal, JournalError
 from i2rl.inference.lme import lme_i2rl
 from i2rl.models import DemonstrationError, TabularMDP, Visibility, concatenate, read_trajectories
