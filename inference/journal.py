@@ -178,7 +178,7 @@ class Origin(NamedTuple):
         kinds = {"configuration": dict, "n_states": int, "n_actions": int, "feature_names": list}
         for name, value in fields.items():
             if type(value) is not kinds.get(name, str):
-                raise ValueError(f"{name} must be a {kinds.get(name, str).__name__}; got {shortened(value)}")
+                raise ValueError(f"{name} must be of type {kinds.get(name, str).__name__}; got {shortened(value)}")
         names = fields["feature_names"]
         if not all(isinstance(name, str) for name in names):
             raise ValueError(f"feature_names must be text; got {shortened(names)}")
@@ -415,8 +415,8 @@ class JournalView:
                 if value is None or (name == "digest" and not _is_hexadecimal(value)):
                     kind, most = _COLUMNS[name]
                     size = f" of at most {most:,} bytes" if most else ""
-                    expected = "a digest" if name == "digest" else f"{kind}{size}"
-                    raise self._damaged(f"session {values[0]} cannot be read: its {name} is not {expected}")
+                    expected = "hexadecimal text" if name == "digest" else f"of type {kind}{size}"
+                    raise self._damaged(f"session {values[0]} cannot be read: {name} must be {expected}")
         return [_Row(*values) for values in rows]
 
     def _verified(self, last: int | None) -> Iterator[_Row]:
@@ -751,6 +751,7 @@ def _migrate(view: JournalView) -> None:
     with view._any_length(), _transaction(connection):
         tree = connection.execute("SELECT coalesce(max(tree), x'') FROM state").fetchone()[0]
         _run(connection, _TO_VERSION_2 + _SINCE_VERSION_2)
+        connection.execute("INSERT INTO state VALUES (1, ?, ?, ?, ?)", (*newest, tree))
         chain = view._genesis
         for row in view._verified(None):
             row = row._replace(state=_stamp(tree) if row.number == newest.session else b"")
@@ -758,7 +759,7 @@ def _migrate(view: JournalView) -> None:
             connection.execute(
                 "UPDATE session SET state = ?, chain = ? WHERE number = ?", (row.state, chain, row.number)
             )
-        connection.execute("INSERT INTO state VALUES (1, ?, ?, ?, ?)", (*newest._replace(chain=chain), tree))
+        connection.execute("UPDATE state SET chain = ?", (chain,))
         connection.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
 
 

@@ -1,7 +1,10 @@
+import hashlib
+import json
 import os
 import re
 import shutil
 import sqlite3
+import struct
 import subprocess
 import sys
 import textwrap
@@ -20,12 +23,14 @@ from hypothesis import strategies as st
 from i2rl.inference.journal import (
     APPLICATION_ID,
     SCHEMA_VERSION,
+    SESSION_BYTES,
     Journal,
     JournalBusy,
     JournalError,
+    Origin,
     Position,
 )
-from i2rl.inference.serialization import decode, encode, restore
+from i2rl.inference.serialization import MOST_LEAVES, decode, demonstration_digest, encode, restore
 from i2rl.models import TabularMDP
 
 # -- a learner small enough to compute by hand ----------------------------------------------------------
@@ -291,17 +296,18 @@ def test_the_position_is_committed_with_the_session(learner: Toy, tmp_path: Path
         assert [record.position.records for record in journal.reports()] == [1, 2, 3, 3]
     with Journal.open(tmp_path / "j", learner) as journal:
         assert journal.position == position
-        assert list(journal.position.unread(lines)) == ["thrée"]
-        assert list(journal.position.unread(line.replace("\n", "\r\n") for line in lines)) == ["thrée"]
+        assert journal.position_after(1) == Position().after("one")
+        assert journal.position_after(9) is None
 
 
-def test_another_input_is_not_continued() -> None:
-    position = Position().after("one\n").after("two\n")
-    for other in (["one\n", "too\n", "three\n"], ["onet\n", "wo\n"], ["two\n", "one\n"]):
-        with pytest.raises(JournalError, match="the first 2 lines of the input are not those"):
-            list(position.unread(other))
-    with pytest.raises(JournalError, match="the input ends after 1 lines, but 2 were"):
-        list(position.unread(["one\n"]))
+def test_positions_tell_lines_apart_but_not_their_ends() -> None:
+    position = Position().after("one\n").after("two\r\n")
+    assert position == Position().after("one").after("two")
+    for other in (["one", "too"], ["onet", "wo"], ["two", "one"], ["one", "", "two"]):
+        here = Position()
+        for line in other:
+            here = here.after(line)
+        assert here != position
 
 
 def test_the_file_grows_by_reports_and_not_by_states(learner: Toy, tmp_path: Path) -> None:
@@ -533,21 +539,254 @@ def test_a_folder_that_cannot_be_written_is_named(learner: Toy) -> None:
         Journal.open("/proc/j", learner)
 
 
-def test_a_damaged_session_is_named(learner: Toy, tmp_path: Path) -> None:
-    with Journal.open(tmp_path / "j", learner) as journal:
-        for state, report in learned(learner, 2):
-            journal.commit(state, report)
-    with sqlite3.connect(tmp_path / "j") as connection:
-        connection.execute("UPDATE session SET report = substr(report, 1, 40) WHERE number = 2")
-        connection.execute("UPDATE state SET tree = substr(tree, 2)")
+# -- damage ---------------------------------------------------------------------------------------------
+
+
+def damaged(path: Path, *statements: str) -> None:
+    connection = sqlite3.connect(path, isolation_level=None)
+    for statement in statements:
+        connection.execute(statement)
     connection.close()
+
+
+@pytest.fixture
+def twelve(learner: Toy, tmp_path: Path) -> Path:
+    """A closed journal of twelve sessions."""
+    with Journal.open(tmp_path / "j", learner) as journal:
+        for state, report in learned(learner, 12):
+            journal.commit(state, report, Position(state.session, "00"), bytes([state.session]))
+    return tmp_path / "j"
+
+
+NESTED = "printf('%.*c', 100000, '[')"
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("DELETE FROM session WHERE number = 5", "it has 11 sessions, but its state counts 12"),
+        ("DELETE FROM session WHERE number = 12", "it has 11 sessions, but its state counts 12"),
+        ("DELETE FROM session", "it has 0 sessions, but its state counts 12"),
+        ("DELETE FROM state", "it has 0 rows of state where one belongs"),
+        ("DELETE FROM origin", "it has 0 rows of origin where one belongs"),
+        ("UPDATE state SET session = 11, sessions = 12", "its state is of session 11, but its last session is 12"),
+        ("UPDATE state SET chain = zeroblob(32)", "its state is not the one that session 12 led to"),
+        ("UPDATE state SET chain = 'x'", "its state does not say after which session it is"),
+        ("UPDATE origin SET content = ''", "its origin cannot be read: it is not JSON"),
+        ("UPDATE origin SET content = x'00'", "its origin cannot be read: it is not JSON"),
+        (f"UPDATE origin SET content = {NESTED}", "its origin cannot be read: it is not JSON"),
+        ("UPDATE origin SET content = '[]'", "its origin cannot be read: its fields must be method, "),
+        (
+            "UPDATE origin SET content = json_set(content, '$.n_states', 'three')",
+            "its origin cannot be read: n_states must be of type int; got 'three'",
+        ),
+        (
+            "UPDATE origin SET content = json_set(content, '$.feature_names', json('[1]'))",
+            r"feature_names must be text; got \[1\]",
+        ),
+        ("UPDATE session SET weights = 'x' WHERE number = 12", "session 12 .* weights must be of type blob of at most"),
+        ("UPDATE session SET digest = 'zz' WHERE number = 12", "session 12 .* digest must be hexadecimal text"),
+        (
+            f"UPDATE session SET report = zeroblob({SESSION_BYTES + 1}) WHERE number = 12",
+            "session 12 cannot be read: report must be of type blob of at most 67,108,864 bytes",
+        ),
+        (
+            "UPDATE session SET report = substr(report, 1, 40) WHERE number = 12",
+            "session 12 cannot be read: the bytes are damaged",
+        ),
+        ("UPDATE session SET records = 0 WHERE number = 12", "session 12 does not follow session 11"),
+        ("UPDATE session SET number = 99 WHERE number = 12", "session 99 does not follow session 11"),
+        ("PRAGMA user_version = 0", "journal version 0"),
+    ],
+)  # fmt: skip
+def test_damage_is_named_before_anything_is_shown_or_learned(
+    statement: str, message: str, twelve: Path, learner: Toy
+) -> None:
+    damaged(twelve, statement)
+    before = snapshot(twelve.parent)
+    for refused in (lambda: Journal.read(twelve), lambda: Journal.open(twelve, learner)):
+        with pytest.raises(JournalError, match=f"{re.escape(str(twelve))} .*{message}"):
+            refused()
+    assert snapshot(twelve.parent) == before
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        (
+            "UPDATE session SET report = (SELECT report FROM session WHERE number = 3) WHERE number = 4",
+            "session 4 does not follow session 3",
+        ),
+        ("UPDATE session SET committed = committed + 1 WHERE number = 1", "session 1 does not follow the journal's"),
+        ("UPDATE session SET weights = 7 WHERE number = 4", "session 4 cannot be read: weights must be of type blob"),
+        ("DELETE FROM session WHERE number = 4; UPDATE state SET sessions = 11", "session 5 does not follow session 3"),
+    ],
+)  # fmt: skip
+def test_a_wrong_history_is_not_shown_as_true(statement: str, message: str, twelve: Path, learner: Toy) -> None:
+    damaged(twelve, *statement.split("; "))
+    with Journal.read(twelve) as view:
+        assert [record.session for record in view.reports(last=3)] == [10, 11, 12]  # nothing else is read
+        for refused in (lambda: list(view.reports()), view.verify, view.to_inference_data):
+            with pytest.raises(JournalError, match=message):
+                refused()
+    with pytest.raises(JournalError, match=message):
+        Journal.open(twelve, learner)
+
+
+def test_a_flipped_bit_and_swapped_rows_are_noticed(twelve: Path) -> None:
+    whole = twelve.read_bytes()
+    with Journal.read(twelve) as view:
+        assert view.verify() == 12
+        weights = list(view.reports())[4].weights.tobytes()
+    at = whole.index(weights)
+    twelve.write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
+    with Journal.read(twelve) as view, pytest.raises(JournalError, match="session 5 cannot be read: .*checksum"):
+        view.verify()
+
+
+@pytest.mark.parametrize(
+    ("statement", "message"),
+    [
+        ("UPDATE state SET tree = 'text'", "the state after session 12 has another size"),
+        ("UPDATE state SET tree = substr(tree, 2)", "the state after session 12 has another size"),
+        ("UPDATE state SET tree = zeroblob(length(tree))", "the state after session 12 cannot be read: it is another"),
+        ("UPDATE state SET tree = zeroblob(100000000)", "the state after session 12 has another size"),
+    ],
+)
+def test_a_damaged_state_is_not_learned_on_from(statement: str, message: str, twelve: Path, learner: Toy) -> None:
+    damaged(twelve, statement)
+    with Journal.read(twelve) as view:
+        assert len(list(view.reports())) == 12
+        with pytest.raises(JournalError, match=message):
+            view.stored_state()
+    with pytest.raises(JournalError, match=message):
+        Journal.open(twelve, learner)
+
+
+def crafted(header: bytes, content: bytes = b"", length: int | None = None) -> bytes:
+    """A tree with this header, whose checksum is right."""
+    body = b"i2rltree" + struct.pack("<I", len(header) if length is None else length) + header + content
+    return body + hashlib.blake2b(body, digest_size=16).digest()
+
+
+def entries(*leaves: Any) -> bytes:
+    return json.dumps(leaves).encode()
+
+
+@pytest.mark.parametrize(
+    "blob",
+    [
+        b"", b"i2rltree", crafted(b""), crafted(b"[", length=2**32 - 1), crafted(b"{}"), crafted(b"7"),
+        crafted(b"[" * 100_000), crafted(entries(*[["a", "numpy", "<f8", []]] * (MOST_LEAVES + 1))),
+        crafted(entries(["a", "numpy", "<f8"])), crafted(entries("leaf")), crafted(entries([["a"], "numpy", "<f8", []])),
+        crafted(entries(["a", "object", "<f8", []]), bytes(8)), crafted(entries(["a", "numpy", "|O", []]), bytes(8)),
+        crafted(entries(["a", "numpy", "V8", []]), bytes(8)), crafted(entries(["a", "numpy", "f8,f8", []]), bytes(16)),
+        crafted(entries(["a", "numpy", "rubbish", []])), crafted(entries(["a", "numpy", "<f8", [-1]])),
+        crafted(entries(["a", "numpy", "<f8", [2**70]])), crafted(entries(["a", "numpy", "<f8", [2**39, 2**39]])),
+        crafted(entries(["a", "numpy", "<f8", [True]]), bytes(8)), crafted(entries(["a", "numpy", "<f8", [1.0]]), bytes(8)),
+        crafted(entries(["a", "numpy", "<f8", [2]]), bytes(8)), crafted(entries(["a", "numpy", "<f8", [1]]), bytes(9)),
+        crafted(entries(["a", "numpy", "<f8", [1] * 33]), bytes(8)), crafted(entries(["a", "text", "<f8", [1]]), bytes(8)),
+        crafted(entries(["a", "python", "<f8", [1]]), bytes(8)), crafted(entries(["a", "none", "|u1", [1]]), bytes(1)),
+        crafted(entries(["a", "numpy", "|u1", [1]], ["a", "numpy", "|u1", [1]]), bytes(2)),
+    ],
+)  # fmt: skip
+def test_bytes_that_nobody_encoded_are_refused_whatever_their_checksum(blob: bytes) -> None:
+    with pytest.raises(ValueError, match="the bytes are damaged"):
+        decode(blob)
+
+
+def test_a_key_that_is_none_is_refused() -> None:
+    for kind, shape in (("key:rubbish", [2]), ("key:threefry2x32", [3])):
+        leaves = decode(crafted(entries(["k", kind, "<u4", shape]), bytes(4 * shape[0])))
+        with pytest.raises(ValueError, match="k is no random key|k is stored as"):
+            restore(leaves, {"k": jax.random.key(0)})
+
+
+def test_a_tree_of_too_many_leaves_and_a_report_of_too_many_bytes_are_not_written(
+    learner: Toy, tmp_path: Path
+) -> None:
+    with pytest.raises(ValueError, match="at most 20,000 leaves"):
+        encode([0] * (MOST_LEAVES + 1))
+    (state, report) = learned(learner, 1)[0]
+    with Journal.open(tmp_path / "j", learner) as journal:
+        with pytest.raises(ValueError, match="must have at most 67,108,864 bytes each"):
+            journal.commit(state, report._replace(gap=np.zeros(SESSION_BYTES // 8, dtype=float)))
+        journal.commit(state, report)
+
+
+def test_a_journal_begun_with_a_legacy_key_goes_on_to_the_bit(learner: Toy, tmp_path: Path) -> None:
+    whole = learned(learner, 3)
+    state, report = whole[0]
+    with Journal.open(tmp_path / "j", learner) as journal:
+        journal.commit(state._replace(key=jax.random.key_data(state.key)), report)
+    with Journal.open(tmp_path / "j", learner) as journal:
+        assert bits(journal.state) == bits(state)
+        assert bits(learned(learner, 2, journal.state)[-1]) == bits(whole[-1])
+
+
+# -- version 1 --------------------------------------------------------------------------------------------
+
+VERSION_1 = """
+CREATE TABLE origin (id INTEGER PRIMARY KEY CHECK (id = 1), content TEXT NOT NULL);
+CREATE TABLE writer (id INTEGER PRIMARY KEY CHECK (id = 1), pid INTEGER NOT NULL, host TEXT NOT NULL);
+CREATE TABLE session (
+    number INTEGER PRIMARY KEY, committed REAL NOT NULL, weights BLOB NOT NULL, report BLOB NOT NULL,
+    records INTEGER NOT NULL, digest TEXT NOT NULL
+);
+CREATE TABLE state (id INTEGER PRIMARY KEY CHECK (id = 1), session INTEGER NOT NULL, tree BLOB NOT NULL);
+PRAGMA application_id=1764913772;
+PRAGMA user_version=1;
+"""
+
+
+def version_1(path: Path, learner: Toy, sessions: int) -> list[tuple[State, Report]]:
+    """A journal as version 1 wrote it."""
+    history = learned(learner, sessions)
+    connection = sqlite3.connect(path)
+    connection.executescript(VERSION_1)
+    connection.execute("INSERT INTO origin VALUES (1, ?)", (json.dumps(Origin.of(learner)._asdict()),))
+    for state, report in history:
+        row = (state.session, 1e9, encode(np.asarray(state.weights)), encode(report), state.session, "00")
+        connection.execute("INSERT INTO session VALUES (?, ?, ?, ?, ?, ?)", row)
+        connection.execute("INSERT OR REPLACE INTO state VALUES (1, ?, ?)", (state.session, encode(state)))
+    connection.commit()
+    connection.close()
+    return history
+
+
+def test_a_journal_of_version_1_is_shown_and_goes_on(learner: Toy, tmp_path: Path) -> None:
+    history = version_1(tmp_path / "j", learner, 5)
     with Journal.read(tmp_path / "j") as view:
-        reading = view.reports()
-        assert next(reading).session == 1
-        with pytest.raises(JournalError, match="session 2 cannot be read: the bytes are damaged"):
-            next(reading)
-    with pytest.raises(JournalError, match="the state after session 2 cannot be read"):
+        shown = list(view.reports())
+        assert (view.session, view.sessions, view.position) == (5, 5, Position(5, "00"))
+    with Journal.open(tmp_path / "j", learner) as journal:
+        assert bits(journal.state) == bits(history[-1][0])
+        journal.commit(*learned(learner, 1, journal.state)[0])
+    with Journal.read(tmp_path / "j") as view:
+        assert view.verify() == 6
+        for old, new in zip(shown, view.reports(), strict=False):
+            assert bits(old.weights) == bits(new.weights)
+            assert old.position == new.position
+    damaged(tmp_path / "j", "UPDATE session SET records = 7 WHERE number = 2")
+    with pytest.raises(JournalError, match="session 2 does not follow session 1"):
         Journal.open(tmp_path / "j", learner)
+
+
+@pytest.mark.parametrize("statement", ["DELETE FROM session", "DELETE FROM session WHERE number = 5", "DELETE FROM state"])
+def test_a_damaged_journal_of_version_1_is_refused(statement: str, learner: Toy, tmp_path: Path) -> None:
+    version_1(tmp_path / "j", learner, 5)
+    damaged(tmp_path / "j", statement)
+    for refused in (lambda: Journal.read(tmp_path / "j"), lambda: Journal.open(tmp_path / "j", learner)):
+        with pytest.raises(JournalError, match="is damaged"):
+            refused()
+
+
+def test_an_empty_journal_of_version_1_begins(learner: Toy, tmp_path: Path) -> None:
+    version_1(tmp_path / "j", learner, 0)
+    with Journal.open(tmp_path / "j", learner) as journal:
+        assert journal.state is None
+        journal.commit(*learned(learner, 1)[0])
+        assert journal.verify() == 1
 
 
 # -- when things break ----------------------------------------------------------------------------------

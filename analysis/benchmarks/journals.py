@@ -379,9 +379,10 @@ def _outcomes(folder: Path, options: argparse.Namespace) -> dict[str, list[Outco
     for what, sessions in (("kills", 2), ("full disks", 4)):
         learn(folder / f"peace-{sessions}.db", sessions)
         peace = content(folder / f"peace-{sessions}.db")
-        outcomes[what] = [outcome(one, peace) for one in left.get(what, [])]
-    if hasattr(os, "geteuid") and os.geteuid() == 0:
-        outcomes["full file systems"] = list(full_file_systems(folder, peace, options.sizes))
+        if what in left:
+            outcomes[what] = [outcome(one, peace) for one in left[what]]
+    if options.file_systems and os.geteuid() == 0:
+        outcomes["full file systems"] = list(full_file_systems(folder, peace, options.file_systems))
     outcomes["damaged"] = list(damaged(folder, options.damaged, options.seed))
     return outcomes
 
@@ -391,6 +392,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0] if __doc__ else None)
     parser.add_argument("--every", type=int, default=1, help="kill at every so many calls; 0 for none")
     parser.add_argument("--sizes", type=int, default=50, help="full disks")
+    parser.add_argument("--file-systems", type=int, default=50, help="full file systems, for root")
     parser.add_argument("--damaged", type=int, default=2000, help="damaged journals")
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args(arguments)
