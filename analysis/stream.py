@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import IO, NamedTuple
+from io import FileIO
+
+from typing import NamedTuple
 
 from jaxtyping import Array
 
@@ -48,27 +51,26 @@ def followed(path: str, say: Callable[[str], None], poll_seconds: float = 0.2) -
     A file that is replaced (rotated) is read to its end, and then the new one from its start. A file that is
     cut off or written anew is read from its start. Both are said; a line that was incomplete then ends.
     """
-    file = open(path, "rb")  # noqa: SIM115 (read to the end of the process)
+    file = open(path, "rb", buffering=0)  # noqa: SIM115 (read to the end of the process)
     tail, leaving = b"", False
     while True:
-        while piece := file.readline(_PIECE):
-            tail = (tail + piece)[-_TAIL:]
-            yield piece
-        time.sleep(poll_seconds)
-        if not file.seekable():
-            continue
         change = ""
-        if _is_rewritten(file, tail):
+        if file.seekable() and _is_rewritten(file, tail):
             change = "was cut off or written anew: reading it from its start"
             file.seek(0)
-        elif Identity.of(path) in (None, Identity.of(file.fileno())):
-            leaving = False
-        elif not leaving:
-            leaving = True  # whoever wrote the old file may just have written to it once more
+        elif block := file.read(_PIECE):
+            tail, leaving = (tail + block)[-_TAIL:], False
+            yield from io.BytesIO(block)
+        elif file.seekable() and Identity.of(path) not in (None, Identity.of(file.fileno())):
+            if leaving:
+                change = "was replaced: the old file is read to its end, reading the new one from its start"
+                file.close()
+                file = open(path, "rb", buffering=0)  # noqa: SIM115
+            else:
+                leaving = True  # whoever writes the old file may not have noticed yet
+                time.sleep(poll_seconds)
         else:
-            change = "was replaced: the old file is read to its end, reading the new one from its start"
-            file.close()
-            file = open(path, "rb")  # noqa: SIM115
+            time.sleep(poll_seconds)
         if change:
             say(f"{path} {change}")
             if tail and not tail.endswith(b"\n"):
@@ -76,10 +78,9 @@ def followed(path: str, say: Callable[[str], None], poll_seconds: float = 0.2) -
             tail, leaving = b"", False
 
 
-def _is_rewritten(file: IO[bytes], tail: bytes) -> bool:
+def _is_rewritten(file: FileIO, tail: bytes) -> bool:
     """Whether the file is shorter than what was read of it, or has other bytes there."""
-    here = file.tell()
-    return os.pread(file.fileno(), len(tail), here - len(tail)) != tail
+    return os.pread(file.fileno(), len(tail), file.tell() - len(tail)) != tail
 
 
 def read_lines(

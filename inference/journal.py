@@ -60,6 +60,7 @@ RECENT = 1000
 """Sessions that are compared with their digests when a journal is opened for writing."""
 
 _MAGIC = b"SQLite format 3\0"
+_UNDO_MAGIC = bytes.fromhex("d9d505f920a163d7")
 
 _SCHEMA = """
 CREATE TABLE origin (id INTEGER PRIMARY KEY CHECK (id = 1), content TEXT NOT NULL);
@@ -794,9 +795,9 @@ def _refuse_foreign(path: Path) -> None:
     if not header:
         return
     if len(header) < HEADER_SIZE and _MAGIC.startswith(header[: len(_MAGIC)]) or not any(header):
-        # The first write to a new file cut short, as by a full disk: SQLite will undo it.
-        if path.with_name(f"{path.name}-journal").exists():
-            return
+        with suppress(OSError), open(path.with_name(f"{path.name}-journal"), "rb") as undo:
+            if undo.read(len(_UNDO_MAGIC)) == _UNDO_MAGIC:
+                return  # the first write to a new file was cut short, as by a full disk: SQLite will undo it
     if len(header) < HEADER_SIZE or not header.startswith(_MAGIC):
         raise JournalError(f"{path} cannot be read as a journal of learning sessions: it is no SQLite file")
     version, application = (int.from_bytes(header[at : at + 4], "big") for at in (60, 68))
