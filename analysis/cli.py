@@ -31,6 +31,9 @@ BROKEN_PIPE = 128 + 13
 """Exit status of a command whose reader went away, as the shell gives it to one that SIGPIPE ends."""
 
 
+LONGEST_MESSAGE = 1000
+
+
 class _Commands(TyperGroup):
     """Commands that end quietly, as other tools do, when the reader of their output (``head``) goes away."""
 
@@ -459,9 +462,8 @@ def learn(
     quarantine: Annotated[
         Path | None, typer.Option(help="Set bad lines aside in this file, with reasons, and go on past them.")
     ] = None,
-    line_bytes: Annotated[
-        int, typer.Option(min=1, help="Most bytes of a line; a longer one is bad.")
-    ] = 4 * 2**20,
+    line_bytes: Annotated[int, typer.Option(min=1, help="Most bytes of a line; a longer one is bad.")] = 4
+    * 2**20,
     line_steps: Annotated[
         int, typer.Option(min=1, help="Most steps of a trajectory; a longer one is bad.")
     ] = 10_000,
@@ -494,10 +496,12 @@ def learn(
         )
         learner = learner._replace(configuration={**learner.configuration, **stream})
         limits = Limits(line_bytes, line_steps)
+        if quarantine is not None:
+            _require_apart(quarantine, demos, journal)
         lines, source = open_lines(demos, follow, limits, skip=quarantine is not None, say=_say)
         with Journal.open(journal, learner) as opened, _progress(as_json) as advance:
             before = opened.session
-            aside = None if quarantine is None else Quarantine(_apart(quarantine, demos, journal))
+            aside = None if quarantine is None else Quarantine(quarantine)
 
             def report_session(report: Any) -> None:
                 if as_json:
@@ -524,12 +528,13 @@ def learn(
                 print(f"{done} sessions learned ({before} were in {journal} before).")
 
 
-def _apart(quarantine: Path, *others: str | Path) -> Path:
-    """The quarantine's path, if it is no file that the command reads or writes otherwise."""
+def _require_apart(quarantine: Path, *others: str | Path) -> None:
+    """Refuse a quarantine that is a file which the command reads or writes otherwise."""
     for other in map(Path, others):
-        if other.exists() and quarantine.exists() and quarantine.samefile(other):
+        if quarantine.resolve() == other.resolve() or (
+            other.exists() and quarantine.exists() and quarantine.samefile(other)
+        ):
             raise ValueError(f"--quarantine must be a file of its own; got {quarantine}, which is {other}")
-    return quarantine
 
 
 @app.command()
@@ -567,7 +572,12 @@ def _print_sessions(view: JournalView, last: int | None) -> None:
     """One JSON object, a session a line, so that a long history is never held whole."""
     print(f'{{"origin": {json.dumps(_plain(view.origin._asdict()))}, "sessions": [', end="")
     for i, r in enumerate(view.reports(last)):
-        fields = {"session": r.session, "committed": r.committed, "weights": r.weights.tolist(), **_plain(r.report)}
+        fields = {
+            "session": r.session,
+            "committed": r.committed,
+            "weights": r.weights.tolist(),
+            **_plain(r.report),
+        }
         print(f"{',' if i else ''}\n{json.dumps(fields)}", end="")
     print("\n]}")
 
@@ -614,6 +624,8 @@ def _reported_errors() -> Iterator[None]:
         message = str(error)
         if isinstance(error, OSError) and error.filename is not None:
             message = f"{error.filename}: {error.strerror}"
+        if len(message) > LONGEST_MESSAGE:
+            message = f"{message[: LONGEST_MESSAGE - 200]} ... {message[-200:]}"
         _say(f"Error: {message}")
         raise typer.Exit(1) from None
 
@@ -732,7 +744,9 @@ def _print_rewards(console: Console, names: Sequence[str], rewards: Any) -> None
         for column in (f"weight{number}", f"L1-normalised{number}"):
             table.add_column(column, justify="right")
     for name, weights in zip(names, rewards.T, strict=True):
-        cells = [x for w, scale in zip(weights, scales, strict=True) for x in (f"{w:.3f}", f"{w / scale:.3f}")]
+        cells = [
+            x for w, scale in zip(weights, scales, strict=True) for x in (f"{w:.3f}", f"{w / scale:.3f}")
+        ]
         table.add_row(name, *cells)
     console.print(table)
 

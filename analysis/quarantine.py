@@ -1,7 +1,7 @@
 """Bad lines of a stream, set aside with their reasons so that learning may go on past them.
 
-A line is in the file, and on the disk, before the journal's position moves past it. So a kill loses none; a
-line that was set aside and is met again, because its session was never committed, is recognised by its digest.
+A line is in the file, and on the disk, before the journal's position moves past it. So a kill loses none. A
+line that is met again, because its session was never committed, is recognised by its digest.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from ..inference.journal import Position
 
 _BEGINNING = b'{"digest": "'
 _PIECE = 1 << 16
+_LONGEST_REASON = 1000
 
 
 class Line(NamedTuple):
@@ -69,7 +70,12 @@ class Quarantine:
         if digest in self._digests:
             return
         entry = {"digest": digest.hex(), "source": source, "line": line.position.records}
-        content = json.dumps(entry | {"reason": reason, "text": line.text.rstrip("\r\n")}).encode() + b"\n"
+        content = (
+            json.dumps(
+                entry | {"reason": reason[:_LONGEST_REASON], "text": line.text.rstrip("\r\n")}
+            ).encode()
+            + b"\n"
+        )
         while content:
             content = content[self._file.write(content) :]
         os.fsync(self._file.fileno())
@@ -83,7 +89,9 @@ class Quarantine:
             start = 0
             while piece := file.readline(_PIECE):
                 if not piece.startswith(_BEGINNING[: len(piece)]):
-                    raise ValueError(f"{self.path} is not a quarantine of lines: its byte {start + 1} begins another")
+                    raise ValueError(
+                        f"{self.path} is not a quarantine of lines: its byte {start + 1} begins another"
+                    )
                 digest, whole = piece[len(_BEGINNING) :][:64], piece
                 while not whole.endswith(b"\n") and (whole := file.readline(_PIECE)):
                     pass

@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from io import FileIO
-
 from typing import NamedTuple
 
 from jaxtyping import Array
@@ -145,12 +144,14 @@ def open_lines(
     limits: Limits = DEFAULT_LIMITS,
     *,
     skip: bool = False,
-    say: Callable[[str], None] = partial(print, file=sys.stderr),
+    say: Callable[[str], None] | None = None,
 ) -> tuple[Iterator[Line], str]:
     """Lines of a file, or of standard input for ``-``, and the name to call it in messages.
 
+    ``say`` takes what there is to tell of a file that is followed; by default it goes to standard error.
     Raises ``OSError``; the lines are as :func:`read_lines` gives them.
     """
+    say = partial(print, file=sys.stderr) if say is None else say
     if path == "-":
         source = "standard input"
         pieces = iter(partial(sys.stdin.buffer.readline, _PIECE), b"")
@@ -189,8 +190,8 @@ def unread(lines: Iterable[Line], journal: Journal) -> Iterator[Line]:
         if (place := known.get(read)) is not None and place.digest and place != line.position:
             raise JournalError(
                 f"lines 1 to {read} of the input are not those that were learned from; to learn from another "
-                "input, start another journal; of a file that was rotated or written anew, give all parts one "
-                "after the other"
+                "input, start another journal; of a file that was rotated or written anew, give all "
+                "its parts, one after the other"
             )
     yield from lines
 

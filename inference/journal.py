@@ -14,10 +14,10 @@ ordinary file. One writer at a time: it holds a lock on ``<path>-lock``, which t
 process ends, however it ends; the empty lock file stays behind.
 
 How damage is noticed. Every session holds a digest of itself and of the session before it, the first one of
-the journal's origin; the state holds the newest digest and the number of sessions. Opening compares the state,
-the newest session (for writing the newest 1,000) and the number of sessions; reading a session compares it with
-those beside it; :meth:`JournalView.verify` compares everything. The digests are no signatures: they reveal accidents, and not
-somebody who computes them anew.
+the journal's origin; the state holds the newest digest and the number of sessions. Opening compares the
+state, the number of sessions and the newest of them (for writing the newest 1,000). Reading a session compares
+it with those beside it, and :meth:`JournalView.verify` compares everything. The digests are no signatures: they
+reveal accidents, and not somebody who computes them anew.
 
 Versions. Journals of version 1 have no digests. :meth:`Journal.open` adds them, taking what is there as true;
 :meth:`Journal.read` shows such a journal unverified.
@@ -41,7 +41,17 @@ import jax
 import numpy as np
 
 from ..models.text import shortened
-from .locking import HEADER_SIZE, Identity, InUse, JournalBusy, JournalError, Lock, connect, explained, header_of
+from .locking import (
+    HEADER_SIZE,
+    Identity,
+    InUse,
+    JournalBusy,
+    JournalError,
+    Lock,
+    connect,
+    explained,
+    header_of,
+)
 from .serialization import DIGEST_SIZE, Leaf, decode, encode, restore
 
 if TYPE_CHECKING:
@@ -129,7 +139,7 @@ class SessionRecord(NamedTuple):
     position : Position
         The input consumed by then.
     demonstration : bytes
-        Digest of what it learned from (:func:`~i2rl.inference.serialization.demonstration_digest`); empty if unknown.
+        Digest of what it learned from (:func:`.serialization.demonstration_digest`); empty if unknown.
     """
 
     session: int
@@ -179,7 +189,9 @@ class Origin(NamedTuple):
         kinds = {"configuration": dict, "n_states": int, "n_actions": int, "feature_names": list}
         for name, value in fields.items():
             if type(value) is not kinds.get(name, str):
-                raise ValueError(f"{name} must be of type {kinds.get(name, str).__name__}; got {shortened(value)}")
+                raise ValueError(
+                    f"{name} must be of type {kinds.get(name, str).__name__}; got {shortened(value)}"
+                )
         names = fields["feature_names"]
         if not all(isinstance(name, str) for name in names):
             raise ValueError(f"feature_names must be text; got {shortened(names)}")
@@ -212,7 +224,9 @@ class Origin(NamedTuple):
 
 
 def _brief(value: object) -> str:
-    return str(value) if isinstance(value, bool | int | float) or value is None else shortened(value).strip("'")
+    return (
+        str(value) if isinstance(value, bool | int | float) or value is None else shortened(value).strip("'")
+    )
 
 
 def _jsonable(value: object) -> object:
@@ -319,7 +333,7 @@ class JournalView:
 
     @property
     def sessions(self) -> int:
-        """How many sessions are in the journal: less than :attr:`session` where one could not be committed."""
+        """How many sessions are there: less than :attr:`session` where one could not be committed."""
         return self._state().sessions
 
     def position_after(self, session: int) -> Position | None:
@@ -408,7 +422,7 @@ class JournalView:
             yield
 
     def _rows(self, which: str, *values: object) -> list[_Row]:
-        """Sessions with values of the right types. Raises :class:`JournalError` naming one that has others."""
+        """Sessions, of the right types. Raises :class:`JournalError` naming one that has others."""
         absent = ("demonstration", "state", "chain") if self._version < 2 else ()
         rows = self._select(f"SELECT {_selected(_COLUMNS, absent)} FROM session {which}", *values)
         for values in rows:
@@ -460,7 +474,7 @@ class JournalView:
         """What the state says of the sessions."""
         if self._version < 2:
             rows = self._select("SELECT session, (SELECT count(*) FROM session) FROM state")
-            return _Newest(*rows[0], b"") if rows else _Newest(0, 0, b"")
+            return _Newest(rows[0][0], rows[0][1], b"") if rows else _Newest(0, 0, b"")
         columns = "session, sessions, iif(typeof(chain) = 'blob' AND length(chain) = 32, chain, NULL)"
         newest = _Newest(*self._single(f"SELECT {columns} FROM state", "state"))
         if not (isinstance(newest.session, int) and isinstance(newest.sessions, int) and newest.chain):
@@ -469,7 +483,9 @@ class JournalView:
 
     def _require_newest(self, newest: _Newest, session: int, chain: bytes) -> None:
         if newest.session != session:
-            raise self._damaged(f"its state is of session {newest.session}, but its last session is {session}")
+            raise self._damaged(
+                f"its state is of session {newest.session}, but its last session is {session}"
+            )
         if self._version > 1 and newest.chain != chain:
             raise self._damaged(f"its state is not the one that session {session} led to")
 
@@ -490,7 +506,9 @@ class JournalView:
                 return {}
             size = self._single("SELECT iif(typeof(tree) = 'blob', length(tree), -1) FROM state", "state")[0]
             if self._version > 1 and (size,) != struct.unpack("<Q", newest[0].state[:8].ljust(8)):
-                raise self._damaged(f"the state after session {newest[0].number} has another size than it had")
+                raise self._damaged(
+                    f"the state after session {newest[0].number} has another size than it had"
+                )
             with self._any_length():
                 tree = self._select("SELECT tree FROM state")[0][0]
         try:
@@ -573,7 +591,7 @@ class Journal(JournalView):
                 if view._version < SCHEMA_VERSION:
                     _migrate(view)
                 connection.execute("PRAGMA journal_mode=WAL")
-                writer = (os.getpid(), platform.node(), str(tuple(lock.identity)))
+                writer = (os.getpid(), platform.node(), str(lock.identity))
                 connection.execute("INSERT OR REPLACE INTO writer VALUES (1, ?, ?, ?)", writer)
                 journal = Journal(path, connection, in_use, lock)
             opened.pop_all()
@@ -600,7 +618,9 @@ class Journal(JournalView):
             opened.callback(connection.close)
             connection.execute("PRAGMA query_only=ON")
             if _is_empty(connection):
-                raise JournalError(f"{path} is empty: no learner has begun in it, or it was ended as it began")
+                raise JournalError(
+                    f"{path} is empty: no learner has begun in it, or it was ended as it began"
+                )
             _require_readable(connection, path)
             view = JournalView(path, connection, in_use)
             opened.pop_all()
@@ -656,7 +676,9 @@ class Journal(JournalView):
         ):
             self._require_undisturbed(session)
             columns = ", ".join(_Row._fields)
-            self._connection.execute(f"INSERT INTO session ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+            self._connection.execute(
+                f"INSERT INTO session ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row
+            )
             self._connection.execute("INSERT OR REPLACE INTO state VALUES (1, ?, ?, ?, ?)", (*newest, tree))
         self._newest = newest
         self.state = state
@@ -682,8 +704,8 @@ class Journal(JournalView):
         """Refuse to go on where a commit would vanish with a deleted file, or mix with another writer's."""
         if displaced := self._displaced():
             raise JournalError(
-                f"{displaced[0]} was deleted or replaced while its journal was open: session {session} was not "
-                f"committed; {self._newest.session} sessions were before"
+                f"{displaced[0]} was deleted or replaced while its journal was open: session {session} was "
+                f"not committed; {self._newest.session} sessions were before"
             )
         if self._state() != self._newest:
             raise JournalError(
@@ -709,7 +731,9 @@ def _restored_state(view: JournalView, learner: Learner) -> Any:
         message = f"{view.path}: the stored state is not one of method {learner.name!r}: {error}"
         raise JournalError(message) from error
     if number != view.session:
-        raise view._damaged(f"its state says that it is of session {number}, its last session is {view.session}")
+        raise view._damaged(
+            f"its state says that it is of session {number}, its last session is {view.session}"
+        )
     return state
 
 
@@ -773,7 +797,7 @@ def _require_alone(connection: sqlite3.Connection, lock: Lock) -> None:
     if connection.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
         return
     with suppress(sqlite3.Error):
-        if connection.execute("SELECT lock FROM writer").fetchone() == (str(tuple(lock.identity)),):
+        if connection.execute("SELECT lock FROM writer").fetchone() == (str(lock.identity),):
             return
     with suppress(sqlite3.OperationalError):
         if connection.execute("PRAGMA journal_mode=DELETE").fetchone()[0] != "wal":
@@ -794,7 +818,7 @@ def _refuse_foreign(path: Path) -> None:
         header = header_of(path)
     if not header:
         return
-    if len(header) < HEADER_SIZE and _MAGIC.startswith(header[: len(_MAGIC)]) or not any(header):
+    if (len(header) < HEADER_SIZE and _MAGIC.startswith(header[: len(_MAGIC)])) or not any(header):
         with suppress(OSError), open(path.with_name(f"{path.name}-journal"), "rb") as undo:
             if undo.read(len(_UNDO_MAGIC)) == _UNDO_MAGIC:
                 return  # the first write to a new file was cut short, as by a full disk: SQLite will undo it

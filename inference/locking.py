@@ -55,6 +55,9 @@ class Identity(NamedTuple):
     device: int
     number: int
 
+    def __str__(self) -> str:
+        return f"{self.device}:{self.number}"
+
     @staticmethod
     def of(path: Path | str | int) -> Identity | None:
         """The identity of an open file, or of the file now at a path; None where there is none."""

@@ -6,8 +6,8 @@ No pickles: reading executes nothing, and the bytes outlive the classes they cam
 
 The header lists ``[name, kind, dtype, shape]`` of every leaf in flattening order; a leaf is its elements in C
 order. Containers are kept only as the paths of their leaves, and static fields not at all: :func:`restore`
-takes both from a template. :func:`decode` trusts nothing of this: a header is checked entry by entry before an
-array is made from it.
+takes both from a template. :func:`decode` trusts nothing of this: every entry of a header is checked before
+an array is made from it.
 """
 
 from __future__ import annotations
@@ -141,7 +141,9 @@ def _trimmed(demonstration: Demonstration) -> Demonstration:
     live = kind != PAD
     rows, width = live.any(1), int(live.any(0).nonzero()[0].max(initial=-1)) + 1
     arrays = (kind.astype(np.int8), state.astype(np.int32), action.astype(np.int32), score.astype(float))
-    return Demonstration(*(x[rows, :width] for x in (*arrays[:3], np.where(np.isnan(score), np.nan, arrays[3]))))
+    return Demonstration(
+        *(x[rows, :width] for x in (*arrays[:3], np.where(np.isnan(score), np.nan, arrays[3])))
+    )
 
 
 class _Description(NamedTuple):
@@ -195,7 +197,7 @@ def _described(entry: Any) -> _Description | None:
         return None
     if not dtype.itemsize or _dtype_name(dtype) != dtype_name:
         return None
-    if kind in ("none", "text") and dtype != np.uint8 or kind == "none" and shape != [0]:
+    if (kind in ("none", "text") and dtype != np.uint8) or (kind == "none" and shape != [0]):
         return None
     return _Description(name, kind, dtype, tuple(shape), math.prod(shape) * dtype.itemsize)
 

@@ -382,9 +382,8 @@ def _require_stream(stream: Any) -> None:
     if isinstance(stream, tuple) and hasattr(stream, "_fields"):
         name = type(stream).__name__
         several = f", {name}.sessions() for one a trajectory" if hasattr(stream, "sessions") else ""
-        raise TypeError(
-            f"`stream` must be an iterable of demonstrations; got one {name}: pass [it] for one session{several}"
-        )
+        advice = f"pass [it] for one session{several}"
+        raise TypeError(f"`stream` must be an iterable of demonstrations; got one {name}: {advice}")
     if not isinstance(stream, Iterable) or isinstance(stream, str | bytes | Mapping):
         raise TypeError(f"`stream` must be an iterable of demonstrations; got {shortened(stream)}")
 
@@ -420,7 +419,8 @@ def _unlearned(
         yield demonstration, digest
     if whole and given < learned:
         raise ValueError(
-            f"the stream ends after {given} demonstrations, but {journal.path} has {learned} sessions: {advice}"
+            f"the stream ends after {given} demonstrations, but {journal.path} has {learned} sessions: "
+            f"{advice}"
         )
 
 

@@ -45,21 +45,25 @@ def listed(names: Any, most: int = 4, limit: int = 40) -> str:
 
 
 class JSONError(ValueError):
+    """Text that is not JSON, or not plainly so; the message says why."""
+
+
+class JSONSyntaxError(JSONError):
     """Text that is not JSON; the message says where and why."""
 
 
 def parsed_json(text: str) -> Any:
-    """Parse JSON text. Raises :class:`JSONError` for whatever is not JSON, or not plainly so.
+    """Parse JSON text. Raises :class:`JSONError` for whatever cannot be read.
 
-    Refused are, beside errors of syntax, nesting deeper than Python's stack, integers of more digits
-    than Python converts (4,300) and objects that have a field twice. ``NaN`` and ``Infinity`` are read as floats.
+    Refused are, beside errors of syntax, nesting deeper than Python's stack, integers of more digits than
+    Python converts (4,300), and objects that have a field twice. ``NaN`` and ``Infinity`` are read as floats.
     """
     try:
         return json.loads(text, object_pairs_hook=_distinct)
     except JSONError:
         raise
     except json.JSONDecodeError as error:
-        raise JSONError(f"not valid JSON at character {error.pos + 1}: {error.msg}") from None
+        raise JSONSyntaxError(f"not valid JSON at character {error.pos + 1}: {error.msg}") from None
     except RecursionError:
         raise JSONError("its lists and objects are nested too deeply") from None
     except ValueError:

@@ -221,7 +221,7 @@ def test_lines_come_out_of_any_pieces_with_their_positions(texts, ends, data):
     pieces = [p for a, b in itertools.pairwise(cuts) for p in whole[a:b].splitlines(keepends=True) if p]
     pieces = [q for p in pieces for q in re.findall(rb"[^\n]*\n|[^\n]+", p)]
     position = Position()
-    expected = [text for text in re.findall(r"[^\n]*\n|[^\n]+", whole.decode())]
+    expected = re.findall(r"[^\n]*\n|[^\n]+", whole.decode())
     for line, text in zip(read_lines(pieces, "input"), expected, strict=True):
         position = position.after(text)
         assert line == Line(text, position)
@@ -244,13 +244,17 @@ def test_of_a_line_without_end_only_the_beginning_is_held():
     # Its position is that of the whole line, so that it may be read in another run that allows more.
     more = list(read_lines(pieces(1000), "demos.jsonl", Limits(line_bytes=1 << 30)))
     assert [line.position for line in more] == [line.position for line in found]
-    with pytest.raises(DemonstrationError, match=r"demos.jsonl, line 2: the line has more than 100,000 bytes \(.*--line"):
+    with pytest.raises(
+        DemonstrationError, match=r"demos.jsonl, line 2: the line has more than 100,000 bytes \(.*--line"
+    ):
         list(read_lines(itertools.chain([b"first\n"], itertools.repeat(b"x" * 1000)), "demos.jsonl", limits))
 
 
 def test_a_trajectory_of_too_many_steps_is_refused_unless_it_is_allowed(learner, tmp_path):
     steps = json.dumps(["hidden"] * 5) + "\n"
-    with pytest.raises(DemonstrationError, match=r"input, line 1: the trajectory has 5 steps, more than 4 \(.*--line-st"):
+    with pytest.raises(
+        DemonstrationError, match=r"input, line 1: the trajectory has 5 steps, more than 4 \(.*--line-st"
+    ):
         learn(learner, [steps], tmp_path / "j", limits=Limits(line_steps=4))
     assert learn(learner, [steps], tmp_path / "j", limits=Limits(line_steps=5)) == 1
 
@@ -306,8 +310,8 @@ BAD = [
 ]
 FEW = Limits(line_bytes=400, line_steps=20)
 REASONS = [
-    "not valid JSON", "unknown state 'attic'", "trajectory 0, step 1: ", "more than 400 bytes", "30 steps, more than 20",
-    "trajectory [01], step 2: ",
+    "not valid JSON", "unknown state 'attic'", "trajectory 0, step 1: ", "more than 400 bytes",
+    "30 steps, more than 20", "trajectory [01], step 2: ",
 ]  # fmt: skip
 
 
@@ -346,7 +350,9 @@ def test_bad_lines_are_set_aside_and_the_good_ones_learned(learner, lines, size,
         assert re.search(reason, entry["reason"])
         assert entry["reason"].startswith("demos.jsonl, ")
         assert entry["source"] == "demos.jsonl"
-        assert entry["text"] == line.rstrip("\n") or (entry["text"].endswith("...") and line.startswith(entry["text"][:99]))
+        assert entry["text"] == line.rstrip("\n") or (
+            entry["text"].endswith("...") and line.startswith(entry["text"][:99])
+        )
 
 
 def test_a_line_is_set_aside_once_wherever_learning_was_interrupted(learner, lines, tmp_path):
@@ -394,7 +400,7 @@ def test_errors_that_are_not_the_lines_own_still_stop(learner, lines, tmp_path):
         def update(self, state, demonstration):
             raise ValueError("a matrix is singular")
 
-    with pytest.raises(ValueError, match="demos.jsonl, line 1: a matrix is singular"):
+    with pytest.raises(ValueError, match=r"demos.jsonl, line 1: a matrix is singular"):
         set_aside(Failing(), lines, tmp_path)
     assert entries(tmp_path) == []
 
@@ -402,7 +408,7 @@ def test_errors_that_are_not_the_lines_own_still_stop(learner, lines, tmp_path):
 @pytest.mark.parametrize("text", ["my notes\n", '{"id": 3}\n', '{"digest": "zz", "line": 3}\n'])
 def test_a_file_of_something_else_takes_no_bad_lines(text, tmp_path):
     (tmp_path / "bad.jsonl").write_text(text)
-    with pytest.raises(ValueError, match="bad.jsonl is not a quarantine of lines"):
+    with pytest.raises(ValueError, match=r"bad.jsonl is not a quarantine of lines"):
         Quarantine(tmp_path / "bad.jsonl")
     assert (tmp_path / "bad.jsonl").read_text() == text
 
@@ -493,7 +499,9 @@ def test_the_last_line_of_a_rotated_file_ends_there(tmp_path):
     assert watched.read(2) == ["thr", "four"]
 
 
-@pytest.mark.parametrize("text", ["1\n", "another line altogether\nand one more\n"], ids=["shorter", "longer"])
+@pytest.mark.parametrize(
+    "text", ["1\n", "another line altogether\nand one more\n"], ids=["shorter", "longer"]
+)
 def test_a_file_written_anew_is_read_from_its_start(text, tmp_path):
     watched = Watched(tmp_path / "demos.jsonl")
     watched.path.write_text(text)  # the same file, truncated first

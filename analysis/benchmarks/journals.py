@@ -1,16 +1,16 @@
 """Journals killed at every write, on full disks, and damaged: python -m i2rl.analysis.benchmarks.journals.
 
-A learner that needs no JAX, whose every state follows from the number of its session, commits a few sessions
-into a journal. Then it does so again while the world is against it, and whatever that leaves is opened, looked
-at, and learned on in to the end. The end has to be the bits of a journal that was left in peace.
+A learner that needs no JAX, and whose state follows from the number of its session, commits a few sessions.
+Then it does so again in adversity. What that leaves is opened, shown, and learned on in to the end. The end
+has to be the bits of a journal that was left in peace.
 
-- Kills: SIGKILL at the first, second, ... call that writes, flushes, cuts or deletes one of the journal's files
-  (``strace`` injects it), from creation to the folding in of the log. Each session is checkpointed, so that
-  kills meet checkpoints.
-- Full disks: the same with files that may grow to so many bytes only (``RLIMIT_FSIZE``), and on file systems of
-  so many pages (a tmpfs, for root). Then there is room again.
-- Damage: random bits, cuts, swapped pages, noise, and rows deleted, exchanged or of other types. A damaged journal
-  is refused with :class:`JournalError`, or everything that it still shows is true.
+- Kills: SIGKILL at the first, second, ... call that writes, flushes, cuts or deletes one of the journal's
+  files (``strace`` injects it), from creation to the folding in of the log. Each session is checkpointed, so
+  that kills meet checkpoints.
+- Full disks: the same with files that may grow to so many bytes only (``RLIMIT_FSIZE``), and on file systems
+  of so many pages (a tmpfs, for root). Then there is room again.
+- Damage: random bits, cuts, swapped pages, noise, and rows deleted, exchanged or of other types. A damaged
+  journal is refused with :class:`JournalError`, or everything that it still shows is true.
 
 Kills and full disks are suffered by forked processes, and only afterwards is anything opened here: JAX, which
 opening a journal uses, does not outlive a fork.
@@ -31,12 +31,13 @@ import tempfile
 import time
 from collections import Counter as Tally
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 
-from ...inference.journal import Journal, JournalError, Position
+from ...inference.journal import Journal, JournalError
 from .harness import print_table, publish
 from .kills import Content, content
 
@@ -225,7 +226,7 @@ def kills_at_every_call(folder: Path, sessions: int = 2, every: int = 1) -> Iter
         n = 1
         while True:
             path, tally = next(paths), _Tally()
-            killed = killed_at(call, n, path, lambda path=path, tally=tally: learn(path, sessions, tally.add))
+            killed = killed_at(call, n, path, partial(learn, path, sessions, tally.add))
             reported = tally.total()
             if not killed:
                 break
@@ -311,15 +312,16 @@ def _damage(path: Path, rng: np.random.Generator, sessions: int) -> str:
     elif kind == "cut":
         del data[rng.integers(len(data)) :]
     elif kind == "pages":
-        a, b = (slice(4096 * i, 4096 * (i + 1)) for i in rng.choice(pages, 2, replace=False))
-        data[a], data[b] = data[b], data[a]
+        one, other = (slice(4096 * i, 4096 * (i + 1)) for i in rng.choice(pages, 2, replace=False))
+        data[one], data[other] = data[other], data[one]
     elif kind == "noise":
         start, size = int(rng.integers(len(data))), int(rng.integers(1, 200))
         data[start : start + size] = rng.bytes(min(size, len(data) - start))
     else:
         a, b = (int(i) for i in rng.integers(1, sessions + 1, 2))
         statements = str(rng.choice(SQL_DAMAGE)).format(
-            a=a, b=b, column=rng.choice(_COLUMNS), of_state=rng.choice(["session", "sessions", "chain", "tree"]),
+            a=a, b=b, column=rng.choice(_COLUMNS),
+            of_state=rng.choice(["session", "sessions", "chain", "tree"]),
             table=rng.choice(["session", "state", "origin", "writer"]), size=int(rng.integers(0, 20_000)),
             text=rng.choice(_ORIGINS),
         )  # fmt: skip
@@ -398,7 +400,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
     options = parser.parse_args(arguments)
     with tempfile.TemporaryDirectory() as name:
         outcomes = _outcomes(Path(name), options)
-    rows, problems, results = [], [], {}
+    rows: list[tuple] = []
+    problems: list[str] = []
+    results: dict[str, Any] = {}
     for what, found in outcomes.items():
         wrong = [f"{what}, {o.case}: {o.problem}" for o in found if o.problem]
         problems += wrong

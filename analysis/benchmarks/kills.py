@@ -15,8 +15,8 @@ milliseconds. So a life's kills are shared out over the phases, and are uniform 
   reporting are all met as often as they take time;
 - closing: after the last session, and once more in a run that finds nothing left to do.
 
-Processes may be forked from one that has imported everything: a kill then costs a third of the time, and none of
-them meets the imports, during which no file is open.
+Processes may be forked from one that has imported everything: a kill then costs about half of the time, and
+none of them meets the imports, during which no file is open.
 
 A kill ends the process and not the system: what power loss leaves is SQLite's matter and not measured here.
 """
@@ -144,7 +144,9 @@ def _arrays(leaves: Mapping[str, Any]) -> Iterator[tuple[str, np.ndarray]]:
 class Started(Protocol):
     """A learner that runs: what it prints, a line a session, and the power to kill it."""
 
-    output: int
+    @property
+    def output(self) -> int:
+        """The descriptor to read that from."""
 
     def kill(self) -> None:
         """End it with SIGKILL."""
@@ -384,7 +386,9 @@ def _survive(
     while len(done) < kills:
         life += 1
         journal = folder / f"life-{life}.db"
-        plan = [str(p) for p in rng.permutation([p for p in shares if p != "closing" for _ in range(shares[p])])]
+        plan = [
+            str(p) for p in rng.permutation([p for p in shares if p != "closing" for _ in range(shares[p])])
+        ]
         plan += ["closing"] * shares["closing"]
         plan, committed = plan[: kills - len(done)], 0
         for i, phase in enumerate(plan):
@@ -466,7 +470,7 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--sessions", type=int, default=400, help="lines of the stream, a session each")
     parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--forked", action="store_true", help="fork learners: a third of the time a kill")
+    parser.add_argument("--forked", action="store_true", help="fork learners: half of the time a kill")
     parser.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.serve is not None:
