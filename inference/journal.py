@@ -15,9 +15,9 @@ process ends, however it ends; the empty lock file stays behind.
 
 How damage is noticed. Every session holds a digest of itself and of the session before it, the first one of
 the journal's origin; the state holds the newest digest and the number of sessions. Opening compares the
-state, the number of sessions and the newest of them (for writing the newest 1,000). Reading a session compares
-it with those beside it, and :meth:`JournalView.verify` compares everything. The digests are no signatures: they
-reveal accidents, and not somebody who computes them anew.
+state, the number of sessions and the newest of them (for writing the newest 1,000). Reading a session
+compares it with those beside it, and :meth:`JournalView.verify` compares everything. The digests are no
+signatures: they reveal accidents, and not somebody who computes them anew.
 
 Versions. Journals of version 1 have no digests. :meth:`Journal.open` adds them, taking what is there as true;
 :meth:`Journal.read` shows such a journal unverified.
