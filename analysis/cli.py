@@ -11,21 +11,44 @@ import os
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from typer.core import TyperGroup
 
 if TYPE_CHECKING:
     from rich.console import Console
 
+    from ..inference.journal import JournalView, SessionRecord
     from ..models.evidence import Imperfection
     from ..models.mdp import TabularMDP
 
+BROKEN_PIPE = 128 + 13
+"""Exit status of a command whose reader went away, as the shell gives it to one that SIGPIPE ends."""
+
+
+LONGEST_MESSAGE = 1000
+
+
+class _Commands(TyperGroup):
+    """Commands that end quietly, as other tools do, when the reader of their output (``head``) goes away."""
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            result = super().invoke(ctx)
+            sys.stdout.flush()  # not left to the interpreter's exit, which would complain
+            return result
+        except BrokenPipeError:
+            os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+            raise typer.Exit(BROKEN_PIPE) from None
+
+
 app = typer.Typer(
+    cls=_Commands,
     help="Learn why somebody acts as they do, while they are still acting, from imperfect observations.",
     no_args_is_help=True,
     add_completion=False,
@@ -447,20 +470,29 @@ def learn(
     solver: Annotated[str, typer.Option(help="newton, ipopt, cvxpy or 'exponentiated gradient'.")] = "newton",
     slack: Annotated[float | None, _real("L1 slack, nats per trajectory.", 0)] = None,
     ridge: Annotated[float, _real("Precision of a Gaussian prior on the weights.", 0)] = 0.0,
-    follow: Annotated[bool, typer.Option("--follow", help="Keep waiting for new lines at the end.")] = False,
+    follow: Annotated[
+        bool, typer.Option("--follow", help="Keep waiting for new lines, also when the file is rotated.")
+    ] = False,
+    quarantine: Annotated[
+        Path | None, typer.Option(help="Set bad lines aside in this file, with reasons, and go on past them.")
+    ] = None,
+    line_bytes: Annotated[int, _count("Most bytes of a line; a longer one is bad.", most=2**40)] = 4 * 2**20,
+    line_steps: Annotated[int, _count("Most steps of a trajectory; a longer one is bad.")] = 10_000,
     seed: Annotated[int, _seed("Seed of the first weights; ignored when resuming.")] = 0,
     as_json: Json = False,
 ) -> None:
     """Learn online from a stream of trajectories; safe to interrupt, and to run again.
 
     Every session is on disk before the next begins. Run the same command again and it goes on where it
-    stopped, to the bit.
+    stopped, to the bit. It checks that the input begins with the lines that it learned from: of a file that
+    was rotated, give all parts one after the other, on standard input.
     """
     import jax
 
     from ..inference.journal import Journal
     from ..inference.lme import DEFAULT_SLACK, lme_i2rl
-    from .stream import learn_stream, open_lines
+    from .quarantine import Quarantine
+    from .stream import Limits, learn_stream, open_lines
 
     with _reported_errors():
         process, sensor = _decision_process(mdp, observability)
@@ -474,9 +506,13 @@ def learn(
             {} if session_size == 1 else {"session_size": session_size}
         )
         learner = learner._replace(configuration={**learner.configuration, **stream})
-        lines, source = open_lines(demos, follow)
+        limits = Limits(line_bytes, line_steps)
+        if quarantine is not None:
+            _require_apart(quarantine, demos, journal)
+        lines, source = open_lines(demos, follow, limits, skip=quarantine is not None, say=_say)
         with Journal.open(journal, learner) as opened, _progress(as_json) as advance:
             before = opened.session
+            aside = None if quarantine is None else Quarantine(quarantine)
 
             def report_session(report: Any) -> None:
                 if as_json:
@@ -486,45 +522,73 @@ def learn(
             try:
                 done = learn_stream(
                     learner, lines, opened, jax.random.key(seed), size=session_size, agent=agent,
-                    source=source, on_session=report_session,
+                    source=source, on_session=report_session, limits=limits, quarantine=aside,
                 )  # fmt: skip
             except KeyboardInterrupt:
                 _say(f"Interrupted; {opened.session} sessions are in {journal}. Run again to go on.")
                 raise typer.Exit(130) from None
+            except BrokenPipeError:
+                _say(f"The output's reader went away; {opened.session} sessions are in {journal}. "
+                     "Run again to go on.")  # fmt: skip
+                raise
+            if aside is not None:
+                counts = f"{aside.added} new, {aside.lines} in all"
+                _say(f"Lines set aside in {quarantine}: {counts}.")
             if not as_json:
                 _print_weights(process, opened.state)
                 print(f"{done} sessions learned ({before} were in {journal} before).")
+
+
+def _require_apart(quarantine: Path, *others: str | Path) -> None:
+    """Refuse a quarantine that is a file which the command reads or writes otherwise."""
+    for other in map(Path, others):
+        if quarantine.resolve() == other.resolve() or (
+            other.exists() and quarantine.exists() and quarantine.samefile(other)
+        ):
+            raise ValueError(f"--quarantine must be a file of its own; got {quarantine}, which is {other}")
 
 
 @app.command()
 def show(
     journal: Annotated[Path, typer.Argument(help="A journal written by learn.")],
     export: Annotated[Path | None, typer.Option(help="Also write the history to this NetCDF file.")] = None,
-    last: Annotated[int, _count("Sessions to list.")] = 10,
+    last: Annotated[int | None, _count("Sessions to show; 10, or all with --json, unless given.")] = None,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Check the whole file against its digests first.")
+    ] = False,
     as_json: Json = False,
 ) -> None:
-    """Show what a journal holds; works while a learner is writing it."""
+    """Show what a journal holds; works while a learner is writing it.
+
+    Sessions that are shown are checked against their digests, and no others are read.
+    """
     from ..inference.journal import Journal
 
     with _reported_errors(), Journal.read(journal) as view:
-        records = list(view.reports())
+        if verify:
+            _say(f"All {view.verify()} sessions are as they were committed.")
         if export is not None:
             view.to_netcdf(export)
         if as_json:
-            content = [
-                {
-                    "session": r.session,
-                    "committed": r.committed,
-                    "weights": r.weights.tolist(),
-                    **_plain(r.report),
-                }
-                for r in records
-            ]
-            print(json.dumps({"origin": _plain(view.origin._asdict()), "sessions": content}))
+            _print_sessions(view, last)
             return
-        _print_history(view, records, last)
+        _print_history(view, list(view.reports(10 if last is None else last)))
         if export is not None:
             print(f"Exported to {export}")
+
+
+def _print_sessions(view: JournalView, last: int | None) -> None:
+    """One JSON object, a session a line, so that a long history is never held whole."""
+    print(f'{{"origin": {json.dumps(_plain(view.origin._asdict()))}, "sessions": [', end="")
+    for i, r in enumerate(view.reports(last)):
+        fields = {
+            "session": r.session,
+            "committed": r.committed,
+            "weights": r.weights.tolist(),
+            **_plain(r.report),
+        }
+        print(f"{',' if i else ''}\n{json.dumps(fields)}", end="")
+    print("\n]}")
 
 
 # -- shared -------------------------------------------------------------------------------------------
@@ -560,17 +624,16 @@ def _reported_errors() -> Iterator[None]:
 
     try:
         yield
-        sys.stdout.flush()  # not left to the interpreter's exit, which would complain of a reader that left
     except BrokenPipeError:
-        # The reader of our output (head, say) has had enough; Python must not complain at exit.
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        raise typer.Exit(0) from None
+        raise
     except (ValueError, OSError, JournalError, ProgramNotSolved) as error:
         if os.environ.get("I2RL_TRACEBACK"):
             raise
         message = str(error)
         if isinstance(error, OSError) and error.filename is not None:
             message = f"{error.filename}: {error.strerror}"
+        if len(message) > LONGEST_MESSAGE:
+            message = f"{message[: LONGEST_MESSAGE - 200]} ... {message[-200:]}"
         _say(f"Error: {message}")
         raise typer.Exit(1) from None
     except MemoryError:
@@ -611,7 +674,11 @@ def _console() -> Console:
     """Tables fit the terminal, and are not squeezed where there is none."""
     from rich.console import Console
 
-    return Console(width=None if sys.stdout.isatty() else 120)
+    class Output(Console):
+        def on_broken_pipe(self) -> None:
+            raise BrokenPipeError  # where Rich would end the process
+
+    return Output(width=None if sys.stdout.isatty() else 120)
 
 
 def _say(text: str) -> None:
@@ -646,32 +713,27 @@ def _print_weights(mdp: TabularMDP, state: Any) -> None:
     _console().print(table)
 
 
-def _print_history(view: Any, records: list[Any], last: int) -> None:
+def _print_history(view: JournalView, records: list[SessionRecord]) -> None:
     from rich.table import Table
 
     origin = view.origin
     console = _console()
     console.print(f"{origin.method} on an MDP of {origin.n_states} states and {origin.n_actions} actions; "
-                  f"{len(records)} sessions")  # fmt: skip
+                  f"{view.sessions} sessions")  # fmt: skip
     if not records:
         return
-    table = Table(title=f"Last {min(last, len(records))} sessions")
-    for column in ("session", "log-likelihood (nats/trajectory)", "EM steps", "seconds"):
+    table = Table(title=f"Last {len(records)} sessions")
+    formats = {"log_likelihood": ".4f", "iterations": ".0f", "seconds": ".4f"}
+    titles = {"log_likelihood": "log-likelihood (nats/trajectory)", "iterations": "EM steps"}
+    shown = [name for name in formats if name in records[-1].report]
+    for column in ("session", *(titles.get(name, name) for name in shown)):
         table.add_column(column, justify="right")
-    for r in records[-last:]:
-        table.add_row(
-            str(r.session), f"{float(r.report['log_likelihood']):.4f}", str(int(r.report["iterations"])),
-            f"{float(r.report['seconds']):.4f}",
-        )  # fmt: skip
+    for r in records:
+        table.add_row(str(r.session), *(f"{float(r.report[name]):{formats[name]}}" for name in shown))
     console.print(table)
     weights = records[-1].weights
-    scale = max(float(abs(weights).sum()), 1e-300)
-    reward = Table(title="Reward weights")
-    for column in ("feature", "weight", "L1-normalised"):
-        reward.add_column(column, justify="left" if column == "feature" else "right")
-    for name, weight in zip(origin.feature_names, weights, strict=True):
-        reward.add_row(name, f"{weight:.3f}", f"{weight / scale:.3f}")
-    console.print(reward)
+    if weights.shape[-1:] == (len(origin.feature_names),) and weights.ndim <= 2:
+        _print_rewards(console, origin.feature_names, weights.reshape(-1, weights.shape[-1]))
     if "agreement" in records[-1].report:
         sensor = Table(title="How often reports agree with the truth")
         sensor.add_column("predicate")
@@ -679,6 +741,25 @@ def _print_history(view: Any, records: list[Any], last: int) -> None:
         for j, agreement in enumerate(records[-1].report["agreement"]):
             sensor.add_row(str(j), f"{agreement:.3f}")
         console.print(sensor)
+
+
+def _print_rewards(console: Console, names: Sequence[str], rewards: Any) -> None:
+    """A table of weights ``[n, K]``, a feature a row: two columns for each reward."""
+    from rich.table import Table
+
+    table = Table(title="Reward weights")
+    table.add_column("feature")
+    scales = [max(float(abs(weights).sum()), 1e-300) for weights in rewards]
+    for i in range(len(rewards)):
+        number = f" {i}" if len(rewards) > 1 else ""
+        for column in (f"weight{number}", f"L1-normalised{number}"):
+            table.add_column(column, justify="right")
+    for name, weights in zip(names, rewards.T, strict=True):
+        cells = [
+            x for w, scale in zip(weights, scales, strict=True) for x in (f"{w:.3f}", f"{w / scale:.3f}")
+        ]
+        table.add_row(name, *cells)
+    console.print(table)
 
 
 def main() -> None:

@@ -2,74 +2,206 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import os
+import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Iterator
-from typing import IO
+from functools import partial
+from io import FileIO
+from typing import NamedTuple
 
 from jaxtyping import Array
 
-from ..inference.journal import Journal, Position
+from ..inference.journal import Journal, JournalError, Position
+from ..inference.locking import Identity
+from ..inference.serialization import demonstration_digest
 from ..inference.session import Learner, Report
-from ..models.demonstration import (
-    Demonstration,
-    DemonstrationError,
-    Record,
-    concatenate,
-    read_trajectories,
-)
+from ..models.demonstration import DemonstrationError, Record, concatenate, read_trajectories
 from ..models.mdp import TabularMDP
+from .quarantine import Line, Quarantine
+
+_PIECE = 1 << 16
+_HEAD = 1000
+_TAIL = 256
 
 
-def follow_lines(file: IO[bytes], poll_seconds: float = 0.2) -> Iterator[bytes]:
-    """Lines of a file that is still being written, as they become complete; never ends by itself."""
-    partial = b""
-    while True:
-        piece = file.readline()
-        if not piece:
-            time.sleep(poll_seconds)
-            continue
-        partial += piece
-        if partial.endswith(b"\n"):
-            yield partial
-            partial = b""
+class Limits(NamedTuple):
+    """The most that is read into memory of one line, and learned from in one trajectory.
 
-
-def batches(
-    lines: Iterable[str], mdp: TabularMDP, position: Position, size: int, agent: int | None, source: str
-) -> Iterator[tuple[Demonstration, Position, list[int]]]:
-    """Sessions of ``size`` trajectories of one agent, the input's position after each, and their lines.
-
-    ``lines`` start after ``position``. Lines of other agents are passed over. An incomplete last session
-    is yielded when the input ends.
+    Evidence about a step takes eight bytes a state and action; 10,000 steps of a patrol take 40 MB.
     """
-    here = position
 
-    def counted() -> Iterator[str]:
-        nonlocal here
-        for line in lines:
-            here = here.after(line)
-            yield line
+    line_bytes: int = 1 << 22
+    line_steps: int = 10_000
 
-    collected: list[Record] = []
 
-    def session() -> tuple[Demonstration, Position, list[int]]:
-        return concatenate([r.demonstration for r in collected]), here, [r.line for r in collected]
+DEFAULT_LIMITS = Limits()
 
-    for record in read_trajectories(counted(), mdp, source, first_line=position.records + 1):
-        if agent is None or record.agent is None or record.agent == agent:
-            collected.append(record)
-        if len(collected) == size:
-            yield session()
-            collected = []
-    if collected:
-        yield session()
+
+# -- lines ------------------------------------------------------------------------------------------------
+
+
+def followed(path: str, say: Callable[[str], None], poll_seconds: float = 0.2) -> Iterator[bytes]:
+    """Pieces of lines of a file that is still being written; never ends by itself.
+
+    A file that is replaced (rotated) is read to its end, and then the new one from its start. A file that is
+    cut off or written anew is read from its start. Both are said; a line that was incomplete then ends.
+    """
+    file = open(path, "rb", buffering=0)  # noqa: SIM115 (read to the end of the process)
+    tail, leaving = b"", False
+    while True:
+        change = ""
+        if file.seekable() and _is_rewritten(file, tail):
+            change = "was cut off or written anew: reading it from its start"
+            file.seek(0)
+        elif block := file.read(_PIECE):
+            tail, leaving = (tail + block)[-_TAIL:], False
+            yield from io.BytesIO(block)
+        elif file.seekable() and Identity.of(path) not in (None, Identity.of(file.fileno())):
+            if leaving:
+                change = "was replaced: the old file is read to its end, reading the new one from its start"
+                file.close()
+                file = open(path, "rb", buffering=0)  # noqa: SIM115
+            else:
+                leaving = True  # whoever writes the old file may not have noticed yet
+                time.sleep(poll_seconds)
+        else:
+            time.sleep(poll_seconds)
+        if change:
+            say(f"{path} {change}")
+            if tail and not tail.endswith(b"\n"):
+                yield b"\n"
+            tail, leaving = b"", False
+
+
+def _is_rewritten(file: FileIO, tail: bytes) -> bool:
+    """Whether the file is shorter than what was read of it, or has other bytes there."""
+    return os.pread(file.fileno(), len(tail), file.tell() - len(tail)) != tail
+
+
+def read_lines(
+    pieces: Iterable[bytes], source: str, limits: Limits = DEFAULT_LIMITS, *, skip: bool = False
+) -> Iterator[Line]:
+    """Put lines together from pieces that end where lines do, if not before.
+
+    No more than ``limits.line_bytes`` of a line are kept; with ``skip`` a longer one comes out with a fault,
+    otherwise :class:`DemonstrationError` is raised as soon as it is too long.
+    """
+    line = _Unfinished(Position())
+    for piece in pieces:
+        line.add(piece, limits.line_bytes)
+        if line.size > limits.line_bytes and not skip:
+            raise DemonstrationError(f"{source}, line {line.before.records + 1}: {_too_long(limits)}")
+        if piece.endswith(b"\n"):
+            finished = line.finished(limits)
+            yield finished
+            line = _Unfinished(finished.position)
+    if line.size:
+        yield line.finished(limits)
+
+
+def _too_long(limits: Limits) -> str:
+    return f"the line has more than {limits.line_bytes:,} bytes (the option --line-bytes allows more)"
+
+
+class _Unfinished:
+    """A line that is being read: its digest of everything, its beginning in memory."""
+
+    def __init__(self, before: Position) -> None:
+        self.before, self.size, self.kept = before, 0, bytearray()
+        self._hash = hashlib.sha256(bytes.fromhex(before.digest))
+        self._returns = 0  # carriage returns, which count unless the line ends with them
+
+    def add(self, piece: bytes, most: int) -> None:
+        if self.size <= most:
+            self.kept += piece
+        self.size += len(piece.removesuffix(b"\n"))
+        body = piece.rstrip(b"\r\n")
+        if body:
+            for _ in range(self._returns):
+                self._hash.update(b"\r")
+            self._returns = 0
+            self._hash.update(body)
+        self._returns += len(piece.removesuffix(b"\n")) - len(body)
+
+    def finished(self, limits: Limits) -> Line:
+        position = Position(self.before.records + 1, self._hash.hexdigest())
+        if self.size > limits.line_bytes:
+            return Line(self.kept[:_HEAD].decode(errors="replace") + "...", position, _too_long(limits))
+        try:
+            return Line(self.kept.decode(), position)
+        except UnicodeDecodeError as error:
+            text = self.kept.decode(errors="backslashreplace")
+            return Line(text, position, f"not UTF-8 text at byte {error.start + 1}")
+
+
+def open_lines(
+    path: str,
+    follow: bool,
+    limits: Limits = DEFAULT_LIMITS,
+    *,
+    skip: bool = False,
+    say: Callable[[str], None] | None = None,
+) -> tuple[Iterator[Line], str]:
+    """Lines of a file, or of standard input for ``-``, and the name to call it in messages.
+
+    ``say`` takes what there is to tell of a file that is followed; by default it goes to standard error.
+    Raises ``OSError``; the lines are as :func:`read_lines` gives them.
+    """
+    say = partial(print, file=sys.stderr) if say is None else say
+    if path == "-":
+        source = "standard input"
+        pieces = iter(partial(sys.stdin.buffer.readline, _PIECE), b"")
+    else:
+        source = os.path.basename(path)
+        file = open(path, "rb")  # noqa: SIM115 (read to the end of the process)
+        pieces = followed(path, say) if follow else iter(partial(file.readline, _PIECE), b"")
+    return read_lines(pieces, source, limits, skip=skip), source
+
+
+def positioned(lines: Iterable[str | Line]) -> Iterator[Line]:
+    """Lines with their positions, which texts have from their number on."""
+    here = Position()
+    for line in lines:
+        line = line if isinstance(line, Line) else Line(line, here.after(line))
+        here = line.position
+        yield line
+
+
+def unread(lines: Iterable[Line], journal: Journal) -> Iterator[Line]:
+    """The lines that the journal has not learned from.
+
+    Raises :class:`JournalError`, before the first of them, where the earlier lines are not those that were
+    learned from.
+    """
+    consumed = journal.position
+    known = {place.records: place for place in (journal.position_after(1), consumed) if place is not None}
+    lines, read = iter(lines), 0
+    while read < consumed.records:
+        line = next(lines, None)
+        if line is None:
+            raise JournalError(
+                f"the input ends after {read} lines, but {consumed.records} were already learned from"
+            )
+        read = line.position.records
+        if (place := known.get(read)) is not None and place.digest and place != line.position:
+            raise JournalError(
+                f"lines 1 to {read} of the input are not those that were learned from; to learn from another "
+                "input, start another journal; of a file that was rotated or written anew, give all "
+                "its parts, one after the other"
+            )
+    yield from lines
+
+
+# -- sessions ---------------------------------------------------------------------------------------------
 
 
 def learn_stream(
     learner: Learner,
-    lines: Iterable[str],
+    lines: Iterable[str | Line],
     journal: Journal,
     key: Array,
     *,
@@ -77,56 +209,120 @@ def learn_stream(
     agent: int | None = None,
     source: str = "input",
     on_session: Callable[[Report], None] | None = None,
+    limits: Limits = DEFAULT_LIMITS,
+    quarantine: Quarantine | None = None,
 ) -> int:
     """Run a session per ``size`` trajectories of JSON Lines, committing each before the next begins.
 
-    Resumes where the journal left off, to the bit: what was consumed is skipped after checking that it is
-    the same input. Returns the number of new sessions. Raises ``DemonstrationError`` naming source, line
-    and step, and ``JournalError``; every session before the error is in the journal.
+    Lines of other agents are passed over; the last session may be shorter. Resumes where the journal left
+    off, to the bit: what was consumed is skipped after checking that it is the same input.
+
+    With ``quarantine`` bad lines are set aside there: those that are no trajectory, are beyond ``limits``, or
+    hold an observation that the model rules out. A session is then made of the next good lines. If it is not
+    known which of a session's trajectories is ruled out, all of its lines are set aside.
+
+    Returns the number of new sessions. Raises ``DemonstrationError`` naming source, line and step, and
+    ``JournalError``; every session before the error is in the journal.
     """
-    position = journal.position
     state = learner.init(key) if journal.state is None else journal.state
+    lines = unread(positioned(lines), journal)
+    records = _Records(lines, learner.mdp, source, limits, journal.position, quarantine)
+    collected: list[tuple[Line, Record]] = []
     done = 0
-    unread = position.unread(lines)
-    for demonstration, after, numbers in batches(unread, learner.mdp, position, size, agent, source):
+
+    def session() -> None:
+        nonlocal state, done
+        demonstration = concatenate([record.demonstration for _, record in collected])
         try:
             state, report = learner.update(state, demonstration)
         except ValueError as error:
             # The learner counts trajectories within a session; a person looks for lines.
+            numbers = [record.line for _, record in collected]
             place = f"line {numbers[0]}" if len(numbers) == 1 else f"session of lines {_listed(numbers)}"
-            raise type(error)(f"{source}, {place}: {error}") from None
-        journal.commit(state, report, after)
+            told = f"{source}, {place}: {error}"
+            if quarantine is None or not isinstance(error, DemonstrationError):
+                raise type(error)(told) from None
+            for line, _ in _ruled_out(collected, error):
+                quarantine.add(source, line, told)
+            return
+        journal.commit(state, report, records.here, demonstration_digest(demonstration))
+        collected.clear()
         done += 1
         if on_session is not None:
             on_session(report)
+
+    for line, record in records:
+        if agent is None or record.agent is None or record.agent == agent:
+            collected.append((line, record))
+        if len(collected) == size:
+            session()
+    while collected:
+        session()
     return done
+
+
+class _Records:
+    """The trajectories of good lines, each with its line; ``here`` is the input consumed so far."""
+
+    def __init__(
+        self,
+        lines: Iterator[Line],
+        mdp: TabularMDP,
+        source: str,
+        limits: Limits,
+        here: Position,
+        quarantine: Quarantine | None,
+    ) -> None:
+        self._lines, self._mdp, self._source, self._limits = lines, mdp, source, limits
+        self.here, self._quarantine = here, quarantine
+        self._line, self._broken = Line("", here), False
+
+    def __iter__(self) -> Iterator[tuple[Line, Record]]:
+        ended = False
+        while not ended:
+            texts, first = self._texts(), self.here.records + 1
+            try:
+                for record in read_trajectories(texts, self._mdp, self._source, first_line=first):
+                    self._require_short(record)
+                    yield self._line, record
+                ended = True
+            except DemonstrationError as error:
+                if self._quarantine is None or self._broken:
+                    raise
+                self._quarantine.add(self._source, self._line, str(error))
+
+    def _texts(self) -> Iterator[str]:
+        while True:
+            self._broken = True  # the lines themselves raise, and there are no more after that
+            line = next(self._lines, None)
+            self._broken = False
+            if line is None:
+                return
+            self._line, self.here = line, line.position
+            if self._line.fault:
+                raise DemonstrationError(f"{self._source}, line {self.here.records}: {self._line.fault}")
+            yield self._line.text
+
+    def _require_short(self, record: Record) -> None:
+        steps = int(record.demonstration.lengths.max())
+        if steps > self._limits.line_steps:
+            raise DemonstrationError(
+                f"{self._source}, line {record.line}: the trajectory has {steps:,} steps, more than "
+                f"{self._limits.line_steps:,} (the option --line-steps allows more)"
+            )
+
+
+def _ruled_out(collected: list[tuple[Line, Record]], error: Exception) -> list[tuple[Line, Record]]:
+    """Take the trajectories of a session that an error is about out of it: one, or all if it names none."""
+    found = re.match(r"trajectory (\d+)\b", str(error))
+    row = int(found[1]) if found is not None else len(collected)
+    named = slice(row, row + 1) if row < len(collected) else slice(None)
+    out = collected[named]
+    del collected[named]
+    return out
 
 
 def _listed(numbers: list[int]) -> str:
     if len(numbers) > 8:
         return f"{numbers[0]} to {numbers[-1]} ({len(numbers)} trajectories)"
     return ", ".join(str(n) for n in numbers)
-
-
-def open_lines(path: str, follow: bool) -> tuple[Iterable[str], str]:
-    """Lines of a file, or of standard input for ``-``, and the name to call it in messages.
-
-    Raises ``FileNotFoundError``; the lines raise ``DemonstrationError`` naming one that is not UTF-8.
-    """
-    if path == "-":
-        return _decoded(sys.stdin.buffer, "standard input"), "standard input"
-    file = open(path, "rb")  # noqa: SIM115 (read to the end of the process)
-    source = os.path.basename(path)
-    return _decoded(follow_lines(file) if follow else file, source), source
-
-
-def _decoded(lines: Iterable[bytes], source: str) -> Iterator[str]:
-    """Text line by line, after the line is complete: a character may be half written at the end of a file."""
-    for number, line in enumerate(lines, start=1):
-        try:
-            text = line.decode()
-        except UnicodeDecodeError as error:
-            raise DemonstrationError(
-                f"{source}, line {number}: not UTF-8 text at byte {error.start + 1}"
-            ) from None
-        yield text

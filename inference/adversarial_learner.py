@@ -38,7 +38,7 @@ from .discriminator import (
 )
 from .discriminator_training import Objective, discriminator_updates
 from .rollouts import finished_returns
-from .session import Learner
+from .session import Learner, as_key
 from .truth_sampling import FaceValue, Truth, look
 
 if TYPE_CHECKING:
@@ -224,7 +224,7 @@ def adversarial(
         return discriminator.logits(network, policy, steps)
 
     def init(key: Array) -> AdversarialState:
-        k_network, k_generator, k_rest = jax.random.split(key, 3)
+        k_network, k_generator, k_rest = jax.random.split(as_key(key), 3)
         network = discriminator.init(k_network)
         acting = generator.init(k_generator)
         blank = blank_steps(task, (how.replay, generator.settings.steps))

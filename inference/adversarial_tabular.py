@@ -32,7 +32,7 @@ from ..models.networks import DTYPE
 from ..models.planning import require_discounted
 from .confusion_fit import ConfusionNoise, ConfusionStatistic, confusion_counts, fitted_confusions
 from .lme import _digest
-from .session import Learner, in_plain_numbers
+from .session import Learner, as_key, in_plain_numbers
 from .smoothing import evidence_of
 from .statistic import blend
 from .tabular_discriminator import (
@@ -278,7 +278,7 @@ def _learner(
     average = AVERAGES[how.average]
 
     def init(key: Array) -> TabularAdversarialState:
-        key, fresh = jax.random.split(key)
+        key, fresh = jax.random.split(as_key(key))
         network = discriminator.init(fresh)
         uniform = jnp.where(mdp.available, -jnp.log(jnp.sum(mdp.available, 1, keepdims=True)), -jnp.inf)
         none = None if look.learned is None else jnp.zeros(len(look.learned.noise))

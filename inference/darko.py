@@ -36,7 +36,7 @@ from ..models.demonstration import PAD, SEEN, UNKNOWN, Demonstration, Demonstrat
 from ..models.evidence import Sensor, require_possible
 from ..models.mdp import Labels, TabularMDP
 from ..models.planning import features_to_go, require_discounted, reward_of, soft_plan
-from .session import Learner, Report
+from .session import Learner, Report, as_key
 from .smoothing import Evidence, evidence_of, smooth_all
 from .statistic import FEATURES, FeatureStatistic, complete
 
@@ -168,7 +168,7 @@ def darko_i2rl(
     )
 
     def init(key: Array) -> DarkoState:
-        weights = jax.random.uniform(key, (mdp.n_features,), float)
+        weights = jax.random.uniform(as_key(key), (mdp.n_features,), float)
         return DarkoState(weights, (), jnp.zeros(mdp.n_states), jnp.zeros((), int))
 
     def session(state: DarkoState, demonstration: Demonstration) -> tuple[DarkoState, Report]:

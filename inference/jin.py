@@ -29,7 +29,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ..models.demonstration import SEEN, UNKNOWN, Demonstration, DemonstrationError
 from ..models.mdp import Labels, TabularMDP
 from ..models.planning import deterministic_policy, hard_plan, occupancy, require_discounted, reward_of
-from .session import Learner, Report
+from .session import Learner, Report, as_key
 
 
 class JinState(NamedTuple):
@@ -135,7 +135,7 @@ def _learner(name: str, mdp: TabularMDP, learning_rate: float) -> Learner:
     rate = jnp.asarray(learning_rate, float)
 
     def init(key: Array) -> JinState:
-        del key  # the first reward is fixed
+        as_key(key)  # unused: the first reward is fixed
         size = mdp.n_features
         return JinState(jnp.full(size, 1 / math.sqrt(size)), (), jnp.zeros((), int))
 

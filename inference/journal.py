@@ -12,6 +12,15 @@ The log's price is shared memory between readers and the writer: keep a journal 
 one, and while it is open (or after a kill) move it together with its ``-wal`` file. A closed journal is one
 ordinary file. One writer at a time: it holds a lock on ``<path>-lock``, which the system releases when the
 process ends, however it ends; the empty lock file stays behind.
+
+How damage is noticed. Every session holds a digest of itself and of the session before it, the first one of
+the journal's origin; the state holds the newest digest and the number of sessions. Opening compares the
+state, the number of sessions and the newest of them (for writing the newest 1,000). Reading a session
+compares it with those beside it, and :meth:`JournalView.verify` compares everything. The digests are no
+signatures: they reveal accidents, and not somebody who computes them anew.
+
+Versions. Journals of version 1 have no digests. :meth:`Journal.open` adds them, taking what is there as true;
+:meth:`Journal.read` shows such a journal unverified.
 """
 
 from __future__ import annotations
@@ -21,6 +30,7 @@ import json
 import os
 import platform
 import sqlite3
+import struct
 import time
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
@@ -30,33 +40,63 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
-from .serialization import Leaf, decode, encode, restore
+from ..models.text import shortened
+from .locking import (
+    HEADER_SIZE,
+    Identity,
+    InUse,
+    JournalBusy,
+    JournalError,
+    Lock,
+    connect,
+    explained,
+    header_of,
+)
+from .serialization import DIGEST_SIZE, Leaf, decode, encode, restore
 
 if TYPE_CHECKING:
     import arviz
 
     from .session import Learner
 
+__all__ = ["Journal", "JournalBusy", "JournalError", "JournalView", "Origin", "Position", "SessionRecord"]
+
 APPLICATION_ID = int.from_bytes(b"i2rl", "big")
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+SESSION_BYTES = 1 << 26
+"""The most that weights, report or origin may take: nothing larger is read into memory, or written."""
+
+RECENT = 1000
+"""Sessions that are compared with their digests when a journal is opened for writing."""
+
+_MAGIC = b"SQLite format 3\0"
+_UNDO_MAGIC = bytes.fromhex("d9d505f920a163d7")
 
 _SCHEMA = """
 CREATE TABLE origin (id INTEGER PRIMARY KEY CHECK (id = 1), content TEXT NOT NULL);
-CREATE TABLE writer (id INTEGER PRIMARY KEY CHECK (id = 1), pid INTEGER NOT NULL, host TEXT NOT NULL);
 CREATE TABLE session (
-    number INTEGER PRIMARY KEY, committed REAL NOT NULL, weights BLOB NOT NULL, report BLOB NOT NULL,
-    records INTEGER NOT NULL, digest TEXT NOT NULL
+    number INTEGER PRIMARY KEY, committed REAL NOT NULL, records INTEGER NOT NULL, digest TEXT NOT NULL,
+    demonstration BLOB NOT NULL, state BLOB NOT NULL, chain BLOB NOT NULL, weights BLOB NOT NULL,
+    report BLOB NOT NULL
 );
-CREATE TABLE state (id INTEGER PRIMARY KEY CHECK (id = 1), session INTEGER NOT NULL, tree BLOB NOT NULL);
 """
-
-
-class JournalError(RuntimeError):
-    """A journal that cannot be opened, read or written; the message names the file and the reason."""
-
-
-class JournalBusy(JournalError):
-    """Another writer holds the journal."""
+_SINCE_VERSION_2 = """
+CREATE INDEX session_demonstration ON session (demonstration);
+CREATE TABLE writer (
+    id INTEGER PRIMARY KEY CHECK (id = 1), pid INTEGER NOT NULL, host TEXT NOT NULL, lock TEXT NOT NULL
+);
+CREATE TABLE state (
+    id INTEGER PRIMARY KEY CHECK (id = 1), session INTEGER NOT NULL, sessions INTEGER NOT NULL,
+    chain BLOB NOT NULL, tree BLOB NOT NULL
+);
+"""
+_TO_VERSION_2 = """
+DROP TABLE writer;
+DROP TABLE state;
+ALTER TABLE session ADD COLUMN demonstration BLOB NOT NULL DEFAULT x'';
+ALTER TABLE session ADD COLUMN state BLOB NOT NULL DEFAULT x'';
+ALTER TABLE session ADD COLUMN chain BLOB NOT NULL DEFAULT x'';
+"""
 
 
 # -- what is kept ---------------------------------------------------------------------------------------
@@ -81,28 +121,6 @@ class Position(NamedTuple):
         content = bytes.fromhex(self.digest) + line.rstrip("\r\n").encode("utf-8", "surrogatepass")
         return Position(self.records + 1, hashlib.sha256(content).hexdigest())
 
-    def unread(self, lines: Iterable[str]) -> Iterator[str]:
-        """The lines not consumed yet.
-
-        Raises :class:`JournalError`, before the first of them, where the earlier lines are not those that
-        were consumed.
-        """
-        lines = iter(lines)
-        here = Position()
-        while here.records < self.records:
-            line = next(lines, None)
-            if line is None:
-                raise JournalError(
-                    f"the input ends after {here.records} lines, but {self.records} were already learned from"
-                )
-            here = here.after(line)
-        if self.digest and here.digest != self.digest:
-            raise JournalError(
-                f"the first {self.records} lines of the input are not those that were learned from; "
-                "to learn from another input, start another journal"
-            )
-        yield from lines
-
 
 class SessionRecord(NamedTuple):
     """One committed session.
@@ -120,6 +138,8 @@ class SessionRecord(NamedTuple):
         key as its key data.
     position : Position
         The input consumed by then.
+    demonstration : bytes
+        Digest of what it learned from (:func:`.serialization.demonstration_digest`); empty if unknown.
     """
 
     session: int
@@ -127,6 +147,7 @@ class SessionRecord(NamedTuple):
     weights: np.ndarray
     report: dict[str, Any]
     position: Position
+    demonstration: bytes = b""
 
 
 class Origin(NamedTuple):
@@ -156,6 +177,26 @@ class Origin(NamedTuple):
             feature_names=tuple(learner.mdp.feature_names),
         )
 
+    @staticmethod
+    def parsed(content: str) -> Origin:
+        """The origin in JSON. Raises ``ValueError`` naming what is not as it should be."""
+        try:
+            fields = json.loads(content)
+        except (ValueError, RecursionError):
+            raise ValueError("it is not JSON") from None
+        if not isinstance(fields, dict) or set(fields) != set(Origin._fields):
+            raise ValueError(f"its fields must be {', '.join(Origin._fields)}; got {shortened(fields)}")
+        kinds = {"configuration": dict, "n_states": int, "n_actions": int, "feature_names": list}
+        for name, value in fields.items():
+            if type(value) is not kinds.get(name, str):
+                raise ValueError(
+                    f"{name} must be of type {kinds.get(name, str).__name__}; got {shortened(value)}"
+                )
+        names = fields["feature_names"]
+        if not all(isinstance(name, str) for name in names):
+            raise ValueError(f"feature_names must be text; got {shortened(names)}")
+        return Origin(**fields | {"feature_names": tuple(names)})
+
     def __str__(self) -> str:
         return (
             f"method {self.method!r} on an MDP with {self.n_states} states, {self.n_actions} actions and "
@@ -177,14 +218,73 @@ class Origin(NamedTuple):
         for key in sorted(self.configuration.keys() | other.configuration.keys()):
             mine, theirs = self.configuration.get(key, "absent"), other.configuration.get(key, "absent")
             if mine != theirs:
-                parts.append(f"{key} ({mine} there, {theirs} here)")
+                parts.append(f"{key} ({_brief(mine)} there, {_brief(theirs)} here)")
         signatures = f"signature {self.signature[:12]} there, {other.signature[:12]} here"
         return ", ".join(parts) or f"configuration ({signatures})"
+
+
+def _brief(value: object) -> str:
+    return (
+        str(value) if isinstance(value, bool | int | float) or value is None else shortened(value).strip("'")
+    )
 
 
 def _jsonable(value: object) -> object:
     is_array = isinstance(value, np.generic | np.ndarray | jax.Array)
     return np.asarray(value).tolist() if is_array else repr(value)
+
+
+# -- rows -----------------------------------------------------------------------------------------------
+
+
+class _Row(NamedTuple):
+    """A session as it is stored."""
+
+    number: int
+    committed: float
+    records: int
+    digest: str
+    demonstration: bytes
+    state: bytes
+    chain: bytes
+    weights: bytes
+    report: bytes
+
+    @property
+    def position(self) -> Position:
+        return Position(self.records, self.digest)
+
+    def linked(self, genesis: bytes, previous: bytes) -> bytes:
+        """The digest that ``chain`` should be, after a session whose digest is ``previous``."""
+        digest = hashlib.blake2b(genesis + previous, digest_size=32)
+        numbers = struct.pack("<qdq", self.number, self.committed, self.records)
+        texts = (self.digest.encode("utf-8", "surrogatepass"), self.demonstration, self.state)
+        for part in (numbers, *texts, self.weights, self.report):
+            digest.update(struct.pack("<Q", len(part)))
+            digest.update(part)
+        return digest.digest()
+
+
+# Type, and the most bytes of a blob. A value of another type or size is not read: NULL comes in its place.
+_COLUMNS: dict[str, tuple[str, int]] = {
+    "number": ("integer", 0), "committed": ("real", 0), "records": ("integer", 0), "digest": ("text", 0),
+    "demonstration": ("blob", 64), "state": ("blob", 64), "chain": ("blob", 64),
+    "weights": ("blob", SESSION_BYTES), "report": ("blob", SESSION_BYTES),
+}  # fmt: skip
+
+
+def _selected(columns: Iterable[str], absent: Sequence[str] = ()) -> str:
+    parts = []
+    for name in columns:
+        kind, most = _COLUMNS[name]
+        small = f" AND length({name}) <= {most}" if most else ""
+        parts.append("x''" if name in absent else f"iif(typeof({name}) = '{kind}'{small}, {name}, NULL)")
+    return ", ".join(parts)
+
+
+def _stamp(tree: bytes) -> bytes:
+    """What a session keeps of the state it led to: the size of its bytes, and their own digest."""
+    return struct.pack("<Q", len(tree)) + tree[-DIGEST_SIZE:]
 
 
 # -- the file -------------------------------------------------------------------------------------------
@@ -198,11 +298,20 @@ class JournalView:
     One thread at a time.
     """
 
-    def __init__(self, path: Path, connection: sqlite3.Connection) -> None:
+    def __init__(self, path: Path, connection: sqlite3.Connection, in_use: InUse) -> None:
         self.path = path
         self._connection = connection
-        content = json.loads(self._select("SELECT content FROM origin")[0][0])
-        self.origin = Origin(**content | {"feature_names": tuple(content["feature_names"])})
+        self._in_use = in_use
+        # SQLite then refuses a longer text before it is read; a state may be longer, and says so itself.
+        connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2 * SESSION_BYTES)
+        self._version = self._select("PRAGMA user_version")[0][0]
+        content = self._single("SELECT iif(typeof(content) = 'text', content, NULL) FROM origin", "origin")[0]
+        try:
+            self.origin = Origin.parsed(content if isinstance(content, str) else "")
+        except ValueError as error:
+            raise self._damaged(f"its origin cannot be read: {error}") from None
+        self._genesis = hashlib.blake2b(content.encode("utf-8", "surrogatepass"), digest_size=32).digest()
+        self._require_agreement()
 
     @property
     def session(self) -> int:
@@ -212,24 +321,56 @@ class JournalView:
     @property
     def position(self) -> Position:
         """The input consumed by the last committed session."""
-        rows = self._select("SELECT records, digest FROM session ORDER BY number DESC LIMIT 1")
-        return Position(*rows[0]) if rows else Position()
+        return self.position_after(self.session) or Position()
 
-    def reports(self) -> Iterator[SessionRecord]:
-        """Every committed session, in order. Raises :class:`JournalError` naming one that is damaged."""
-        columns = "number, committed, weights, report, records, digest"
-        for number, committed, weights, report, *position in self._select(
-            f"SELECT {columns} FROM session ORDER BY number"
-        ):
-            try:
-                fields = {name: leaf.plain for name, leaf in decode(report).items()}
-                yield SessionRecord(number, committed, decode(weights)[""].value, fields, Position(*position))
-            except ValueError as error:
-                raise JournalError(f"{self.path}: session {number} cannot be read: {error}") from error
+    def reports(self, last: int | None = None) -> Iterator[SessionRecord]:
+        """Committed sessions, in order: all of them, or the ``last`` few, of which no others are read.
+
+        Raises :class:`JournalError` naming one that is damaged, or between which two something is missing.
+        """
+        for row in self._verified(last):
+            yield self._record(row)
+
+    @property
+    def sessions(self) -> int:
+        """How many sessions are there: less than :attr:`session` where one could not be committed."""
+        return self._state().sessions
+
+    def position_after(self, session: int) -> Position | None:
+        """The input consumed by a session; None if there is no such session."""
+        found = self._rows("WHERE number = ?", session)
+        return found[0].position if found else None
+
+    def demonstration(self, session: int) -> bytes:
+        """Digest of what a session learned from; empty if unknown, or if there is no such session."""
+        found = self._rows("WHERE number = ?", session)
+        return found[0].demonstration if found else b""
+
+    def learned_from(self, demonstration: bytes) -> int | None:
+        """The first session that learned from a demonstration with this digest; None if there is none."""
+        if self._version < 2:
+            return None
+        query = "SELECT min(number) FROM session WHERE demonstration = ?"
+        return self._select(query, demonstration)[0][0]
 
     def stored_state(self) -> dict[str, Any]:
         """The newest state's leaves by name (as in :attr:`SessionRecord.report`); empty before the first."""
-        return {name: leaf.plain for name, leaf in self._state_leaves().items()}
+        try:
+            return {name: leaf.plain for name, leaf in self._state_leaves().items()}
+        except ValueError as error:
+            raise self._damaged(f"its state cannot be read: {error}") from None
+
+    def verify(self) -> int:
+        """Compare everything with its digest, and check the file's structure; return the sessions found.
+
+        Raises :class:`JournalError` naming the first thing that is damaged.
+        """
+        found = self._select("PRAGMA quick_check(1)")[0][0]
+        if found != "ok":
+            raise self._damaged(shortened(found, 200))
+        sessions = sum(1 for _ in self.reports())
+        self.stored_state()
+        return sessions
 
     def to_inference_data(self) -> arviz.InferenceData:
         """The sessions as ArviZ ``InferenceData`` with one group, ``sessions``.
@@ -250,6 +391,7 @@ class JournalView:
     def close(self) -> None:
         """Close the file; closing again does nothing."""
         self._connection.close()
+        self._in_use.release()
 
     def __enter__(self) -> JournalView:
         return self
@@ -257,17 +399,142 @@ class JournalView:
     def __exit__(self, *error: object) -> None:
         self.close()
 
-    def _select(self, query: str) -> list[tuple]:
-        with _explained(self.path, "be read"):
-            return self._connection.execute(query).fetchall()
+    def _damaged(self, what: str) -> JournalError:
+        return JournalError(f"{self.path} is damaged: {what}")
+
+    def _select(self, query: str, *values: object) -> list[tuple]:
+        with explained(self.path, "be read"):
+            return self._connection.execute(query, values).fetchall()
+
+    def _single(self, query: str, table: str) -> tuple:
+        rows = self._select(query)
+        if len(rows) != 1:
+            raise self._damaged(f"it has {len(rows)} rows of {table} where one belongs")
+        return rows[0]
+
+    @contextmanager
+    def _moment(self) -> Iterator[None]:
+        """Let several queries see the same sessions."""
+        if self._connection.in_transaction:
+            yield
+            return
+        with explained(self.path, "be read"), _transaction(self._connection, "BEGIN"):
+            yield
+
+    def _rows(self, which: str, *values: object) -> list[_Row]:
+        """Sessions, of the right types. Raises :class:`JournalError` naming one that has others."""
+        absent = ("demonstration", "state", "chain") if self._version < 2 else ()
+        rows = self._select(f"SELECT {_selected(_COLUMNS, absent)} FROM session {which}", *values)
+        for values in rows:
+            for name, value in zip(_COLUMNS, values, strict=True):
+                if value is None or (name == "digest" and not _is_hexadecimal(value)):
+                    kind, most = _COLUMNS[name]
+                    size = f" of at most {most:,} bytes" if most else ""
+                    expected = "hexadecimal text" if name == "digest" else f"of type {kind}{size}"
+                    raise self._damaged(f"session {values[0]} cannot be read: {name} must be {expected}")
+        return [_Row(*values) for values in rows]
+
+    def _verified(self, last: int | None) -> Iterator[_Row]:
+        """Sessions in order, each compared with the one before it, and the newest with the state."""
+        before, chain = 0, self._genesis
+        if last is not None:
+            for row in self._rows("ORDER BY number DESC LIMIT 1 OFFSET ?", last):
+                before, chain = row.number, row.chain
+        while True:
+            with self._moment():
+                rows = self._rows("WHERE number > ? ORDER BY number LIMIT 1", before)
+                newest = None if rows else self._state()
+            if newest is not None:
+                self._require_newest(newest, before, chain)
+                return
+            row = rows[0]
+            if self._version > 1 and row.linked(self._genesis, chain) != row.chain:
+                self._record(row)  # which says so if its own bytes are damaged
+                after = f"session {before}" if before else "the journal's beginning"
+                raise self._damaged(
+                    f"session {row.number} does not follow {after}: one of them was changed, or one between "
+                    "them is missing"
+                )
+            before, chain = row.number, row.chain
+            yield row
+
+    def _record(self, row: _Row) -> SessionRecord:
+        try:
+            fields = {name: leaf.plain for name, leaf in decode(row.report).items()}
+            weights = decode(row.weights)
+            if list(weights) != [""]:
+                raise ValueError("its weights are not one array")
+        except ValueError as error:
+            raise self._damaged(f"session {row.number} cannot be read: {error}") from None
+        return SessionRecord(
+            row.number, row.committed, weights[""].value, fields, row.position, row.demonstration
+        )
+
+    def _state(self) -> _Newest:
+        """What the state says of the sessions."""
+        if self._version < 2:
+            rows = self._select("SELECT session, (SELECT count(*) FROM session) FROM state")
+            return _Newest(rows[0][0], rows[0][1], b"") if rows else _Newest(0, 0, b"")
+        columns = "session, sessions, iif(typeof(chain) = 'blob' AND length(chain) = 32, chain, NULL)"
+        newest = _Newest(*self._single(f"SELECT {columns} FROM state", "state"))
+        if not (isinstance(newest.session, int) and isinstance(newest.sessions, int) and newest.chain):
+            raise self._damaged("its state does not say after which session it is")
+        return newest
+
+    def _require_newest(self, newest: _Newest, session: int, chain: bytes) -> None:
+        if newest.session != session:
+            raise self._damaged(
+                f"its state is of session {newest.session}, but its last session is {session}"
+            )
+        if self._version > 1 and newest.chain != chain:
+            raise self._damaged(f"its state is not the one that session {session} led to")
+
+    def _require_agreement(self) -> None:
+        """Compare the state, the number of sessions and the newest of them."""
+        with self._moment():
+            newest = self._state()
+            count = self._select("SELECT count(*) FROM session")[0][0]
+            if count != newest.sessions:
+                raise self._damaged(f"it has {count} sessions, but its state counts {newest.sessions}")
+            for _ in self._verified(last=1):
+                pass
 
     def _state_leaves(self) -> dict[str, Leaf]:
-        rows = self._select("SELECT session, tree FROM state")
+        with self._moment():
+            newest = self._rows("ORDER BY number DESC LIMIT 1")
+            if not newest:
+                return {}
+            size = self._single("SELECT iif(typeof(tree) = 'blob', length(tree), -1) FROM state", "state")[0]
+            if self._version > 1 and (size,) != struct.unpack("<Q", newest[0].state[:8].ljust(8)):
+                raise self._damaged(
+                    f"the state after session {newest[0].number} has another size than it had"
+                )
+            with self._any_length():
+                tree = self._select("SELECT tree FROM state")[0][0]
         try:
-            return decode(rows[0][1]) if rows else {}
-        except ValueError as error:
-            message = f"{self.path}: the state after session {rows[0][0]} cannot be read: {error}"
-            raise JournalError(message) from error
+            if self._version > 1 and _stamp(tree) != newest[0].state:
+                raise ValueError("it is another state")
+            return decode(tree)
+        except (ValueError, TypeError) as error:
+            message = f"the state after session {newest[0].number} cannot be read: {error}"
+            raise self._damaged(message) from None
+
+    @contextmanager
+    def _any_length(self) -> Iterator[None]:
+        """Let SQLite read or write a value that is longer than a session's may be: a state."""
+        before = self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2**31 - 1)
+        try:
+            yield
+        finally:
+            self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, before)
+
+
+class _Newest(NamedTuple):
+    """After which session a state is, how many there are by then, and the digest of the last."""
+
+    session: int
+    sessions: int
+    chain: bytes
 
 
 class Journal(JournalView):
@@ -280,10 +547,12 @@ class Journal(JournalView):
         learning starts from ``learner.init(key)``.
     """
 
-    def __init__(self, path: Path, connection: sqlite3.Connection, lock: _Lock, state: Any) -> None:
-        super().__init__(path, connection)
+    def __init__(self, path: Path, connection: sqlite3.Connection, in_use: InUse, lock: Lock) -> None:
+        super().__init__(path, connection, in_use)
         self._lock = lock
-        self.state = state
+        self._newest = self._state()
+        self.state: Any = None
+        self._files: dict[Path, Identity | None] = {}
 
     @staticmethod
     def open(path: str | os.PathLike[str], learner: Learner) -> Journal:
@@ -291,56 +560,75 @@ class Journal(JournalView):
 
         Raises :class:`JournalBusy` where another writer has it open, and :class:`JournalError` where the file
         is no journal (it is left as it was), was made by a newer version, belongs to another MDP, method or
-        configuration, or cannot be read or written.
+        configuration, is damaged, or cannot be read or written.
         """
         path = Path(path).resolve()
         _refuse_foreign(path)
         with ExitStack() as opened:
-            lock = opened.enter_context(_Lock(path))
-            with _explained(path, "be opened for writing"):
-                connection = _connect(path, "rwc")
+            lock = opened.enter_context(Lock(path))
+            with explained(path, "be opened for writing"):
+                in_use = InUse(path, create=True)
+                opened.callback(in_use.release)
+                connection = connect(path, "rw")
                 opened.callback(connection.close)
                 connection.execute("PRAGMA synchronous=FULL")
                 connection.execute("PRAGMA fullfsync=ON")  # macOS: its plain flush stops short of the disk
                 origin = Origin.of(learner)
-                if not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+                if _is_empty(connection):
                     _create(connection, origin)
                 _require_readable(connection, path)
-                view = JournalView(path, connection)
+                view = JournalView(path, connection, in_use)
                 if difference := view.origin.difference(origin):
                     raise JournalError(
                         f"{path} is a journal of {view.origin}, but this learner is {origin}; "
                         f"what differs: {difference}"
                     )
+                for _ in view._verified(last=RECENT):
+                    pass
                 state = _restored_state(view, learner)
                 # Not before here, so that a journal that is refused stays as it was.
+                _require_alone(connection, lock)
+                if view._version < SCHEMA_VERSION:
+                    _migrate(view)
                 connection.execute("PRAGMA journal_mode=WAL")
-                writer = (os.getpid(), platform.node())
-                connection.execute("INSERT OR REPLACE INTO writer VALUES (1, ?, ?)", writer)
+                writer = (os.getpid(), platform.node(), str(lock.identity))
+                connection.execute("INSERT OR REPLACE INTO writer VALUES (1, ?, ?, ?)", writer)
+                journal = Journal(path, connection, in_use, lock)
             opened.pop_all()
-            return Journal(path, connection, lock, state)
+        journal.state = state
+        files = (path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm")))
+        journal._files = {file: Identity.of(file) for file in files} | {lock.file: lock.identity}
+        return journal
 
     @staticmethod
     def read(path: str | os.PathLike[str]) -> JournalView:
         """Open a journal for looking at, also while a writer runs and without knowing its learner.
 
-        Raises :class:`JournalError` where there is no journal or it was made by a newer version.
+        Raises :class:`JournalError` where there is no journal, it was made by a newer version, or is damaged.
         """
         path = Path(path).resolve()
         if not path.exists():
             raise JournalError(f"{path} does not exist")
         _refuse_foreign(path)
-        with _explained(path, "be read"), ExitStack() as opened:
+        with explained(path, "be read"), ExitStack() as opened:
+            in_use = InUse(path)
+            opened.callback(in_use.release)
             # Not opened read-only: what a killed writer left half done is then undone before it is read.
-            connection = _connect(path, "rw")
+            connection = connect(path, "rw")
             opened.callback(connection.close)
             connection.execute("PRAGMA query_only=ON")
+            if _is_empty(connection):
+                raise JournalError(
+                    f"{path} is empty: no learner has begun in it, or it was ended as it began"
+                )
             _require_readable(connection, path)
-            view = JournalView(path, connection)
+            view = JournalView(path, connection, in_use)
             opened.pop_all()
             return view
 
-    def commit(self, state: Any, report: Any, position: Position | None = None) -> None:
+    def commit(
+        self, state: Any, report: Any, position: Position | None = None, demonstration: bytes = b""
+    ) -> None:
         """Commit one session: durable, all of it, when this returns.
 
         Parameters
@@ -351,97 +639,85 @@ class Journal(JournalView):
             The session's report.
         position : Position, optional
             The input consumed so far; by default what it was.
+        demonstration : bytes, optional
+            Digest of what the session learned from, by which it is recognised later.
 
         Raises
         ------
         ValueError
-            The session is already committed: its number is not above :attr:`session`.
+            The session is already committed: its number is not above :attr:`session`. Or its weights or
+            report are larger than :data:`SESSION_BYTES`.
         JournalError
-            It could not be written (a full disk, say). What was committed before is as it was, and the same
-            session, or a later one, may be committed once the cause is gone; a session that never was is
-            missing from the history, though not from the state.
+            It could not be written (a full disk, say), or the file was deleted, replaced or written to by
+            another program. What was committed before is as it was, and the same session, or a later one, may
+            be committed once the cause is gone; a session that never was is missing from the history, though
+            not from the state.
         """
-        session, last = int(state.session), self.session
+        session, last = int(state.session), self._newest.session
         if session <= last:
             raise ValueError(f"{self.path}: session {session} is already committed (the last is {last})")
+        weights, tree, told = encode(np.asarray(state.weights)), encode(state), encode(report)
+        if max(len(weights), len(told)) > SESSION_BYTES:
+            raise ValueError(
+                f"weights and report of a session must have at most {SESSION_BYTES:,} bytes each; got "
+                f"{len(weights):,} and {len(told):,}"
+            )
         records, digest = self.position if position is None else position
-        weights, tree = encode(np.asarray(state.weights)), encode(state)
-        row = (session, time.time(), weights, encode(report), records, digest)
+        row = _Row(
+            session, time.time(), records, digest, demonstration, _stamp(tree), b"", weights, told
+        )  # fmt: skip
+        row = row._replace(chain=row.linked(self._genesis, self._newest.chain))
+        newest = _Newest(session, self._newest.sessions + 1, row.chain)
         kept = f"what was committed up to session {last} is safe" if last else "nothing was committed before"
-        with _explained(self.path, f"take session {session} ({kept})"), _transaction(self._connection):
-            self._connection.execute("INSERT INTO session VALUES (?, ?, ?, ?, ?, ?)", row)
-            self._connection.execute("INSERT OR REPLACE INTO state VALUES (1, ?, ?)", (session, tree))
+        with (
+            explained(self.path, f"take session {session} ({kept})"),
+            self._any_length(),
+            _transaction(self._connection),
+        ):
+            self._require_undisturbed(session)
+            columns = ", ".join(_Row._fields)
+            self._connection.execute(
+                f"INSERT INTO session ({columns}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)", row
+            )
+            self._connection.execute("INSERT OR REPLACE INTO state VALUES (1, ?, ?, ?, ?)", (*newest, tree))
+        self._newest = newest
         self.state = state
 
     def close(self) -> None:
         """Fold the log into the file and release the lock; closing again does nothing."""
         with suppress(sqlite3.Error):  # with a reader there, or a full disk, the log stays, as durable
             self._connection.execute("PRAGMA busy_timeout=0")
-            self._connection.execute("PRAGMA journal_mode=DELETE")
-        self._connection.close()
+            # SQLite deletes the log by its name, which after a replacement is another writer's.
+            if not self._displaced():
+                self._connection.execute("PRAGMA journal_mode=DELETE")
+        super().close()
         self._lock.release()
 
     def __enter__(self) -> Journal:
         return self
 
+    def _displaced(self) -> list[Path]:
+        """Files that are no longer the ones that were opened."""
+        return [file for file, identity in self._files.items() if Identity.of(file) != identity]
 
-class _Lock:
-    """The writer's exclusive lock, held on a file of its own so that readers are not shut out.
-
-    It is SQLite's own file lock: released by the system with the process, seen by other connections of the
-    same process, and there on every system that SQLite runs on.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path = path
-
-    def __enter__(self) -> _Lock:
-        if not self.path.parent.is_dir():
-            raise JournalError(f"{self.path} cannot be made: there is no folder {self.path.parent}")
-        with _explained(self.path, "be locked for writing (is its folder read-only?)"):
-            lock = _connect(self.path.with_name(self.path.name + "-lock"), "rwc", timeout=0.0)
-            try:
-                lock.execute("BEGIN EXCLUSIVE")
-            except sqlite3.Error as error:
-                lock.close()
-                if error.sqlite_errorcode & 0xFF != sqlite3.SQLITE_BUSY:
-                    raise
-                raise JournalBusy(
-                    f"{self.path} is open for writing in {self._holder()}: one writer at a time; "
-                    "Journal.read looks at it without writing"
-                ) from None
-        self._connection = lock
-        return self
-
-    def __exit__(self, *error: object) -> None:
-        self.release()
-
-    def release(self) -> None:
-        self._connection.close()
-
-    def _holder(self) -> str:
-        with suppress(sqlite3.Error, TypeError):  # TypeError: no row, as it is still being made
-            connection = _connect(self.path, "rw")
-            try:
-                pid, host = connection.execute("SELECT pid, host FROM writer").fetchone()
-            finally:
-                connection.close()
-            here = (pid, host) == (os.getpid(), platform.node())
-            return "this process" if here else f"process {pid} on {host}"
-        return "another process"
+    def _require_undisturbed(self, session: int) -> None:
+        """Refuse to go on where a commit would vanish with a deleted file, or mix with another writer's."""
+        if displaced := self._displaced():
+            raise JournalError(
+                f"{displaced[0]} was deleted or replaced while its journal was open: session {session} was "
+                f"not committed; {self._newest.session} sessions were before"
+            )
+        if self._state() != self._newest:
+            raise JournalError(
+                f"{self.path} was written to by another program: session {session} was not committed; this "
+                f"writer's last is {self._newest.session}"
+            )
 
 
-def _connect(path: Path, mode: str, timeout: float = 10.0) -> sqlite3.Connection:
-    uri = f"{path.as_uri()}?mode={mode}"
-    return sqlite3.connect(uri, uri=True, timeout=timeout, isolation_level=None, check_same_thread=False)
-
-
-@contextmanager
-def _explained(path: Path, doing: str) -> Iterator[None]:
-    try:
-        yield
-    except sqlite3.Error as error:
-        raise JournalError(f"{path} cannot {doing}: {error}") from error
+def _is_hexadecimal(text: Any) -> bool:
+    with suppress(ValueError):
+        return isinstance(text, str) and len(text) <= 128 and len(bytes.fromhex(text)) * 2 == len(text)
+    return False
 
 
 def _restored_state(view: JournalView, learner: Learner) -> Any:
@@ -449,15 +725,21 @@ def _restored_state(view: JournalView, learner: Learner) -> Any:
     if not leaves:
         return None
     try:
-        return restore(leaves, learner.init(jax.random.key(0)))
-    except ValueError as error:
+        state = restore(leaves, learner.init(jax.random.key(0)))
+        number = int(state.session)
+    except (TypeError, ValueError) as error:
         message = f"{view.path}: the stored state is not one of method {learner.name!r}: {error}"
         raise JournalError(message) from error
+    if number != view.session:
+        raise view._damaged(
+            f"its state says that it is of session {number}, its last session is {view.session}"
+        )
+    return state
 
 
 @contextmanager
-def _transaction(connection: sqlite3.Connection) -> Iterator[None]:
-    connection.execute("BEGIN IMMEDIATE")
+def _transaction(connection: sqlite3.Connection, begin: str = "BEGIN IMMEDIATE") -> Iterator[None]:
+    connection.execute(begin)
     try:
         yield
         connection.execute("COMMIT")
@@ -467,36 +749,94 @@ def _transaction(connection: sqlite3.Connection) -> Iterator[None]:
         raise
 
 
+def _run(connection: sqlite3.Connection, statements: str) -> None:
+    for statement in statements.split(";"):
+        connection.execute(statement)
+
+
+def _is_empty(connection: sqlite3.Connection) -> bool:
+    return not connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]
+
+
 def _create(connection: sqlite3.Connection, origin: Origin) -> None:
     # Before the file is switched to the log, so that its very header tells what it is.
+    content = json.dumps(origin._asdict())
+    genesis = hashlib.blake2b(content.encode(), digest_size=32).digest()
     with _transaction(connection):
-        for statement in _SCHEMA.split(";"):
-            connection.execute(statement)
-        connection.execute("INSERT INTO origin VALUES (1, ?)", (json.dumps(origin._asdict()),))
+        _run(connection, _SCHEMA + _SINCE_VERSION_2)
+        connection.execute("INSERT INTO origin VALUES (1, ?)", (content,))
+        connection.execute("INSERT INTO state VALUES (1, 0, 0, ?, x'')", (genesis,))
         connection.execute(f"PRAGMA application_id={APPLICATION_ID}")
         connection.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+
+
+def _migrate(view: JournalView) -> None:
+    """Add what version 2 has and version 1 has not: digests, computed from what is there."""
+    connection, newest = view._connection, view._state()
+    with view._any_length(), _transaction(connection):
+        tree = connection.execute("SELECT coalesce(max(tree), x'') FROM state").fetchone()[0]
+        _run(connection, _TO_VERSION_2 + _SINCE_VERSION_2)
+        connection.execute("INSERT INTO state VALUES (1, ?, ?, ?, ?)", (*newest, tree))
+        chain = view._genesis
+        for row in view._verified(None):
+            row = row._replace(state=_stamp(tree) if row.number == newest.session else b"")
+            chain = row.linked(view._genesis, chain)
+            connection.execute(
+                "UPDATE session SET state = ?, chain = ? WHERE number = ?", (row.state, chain, row.number)
+            )
+        connection.execute("UPDATE state SET chain = ?", (chain,))
+        connection.execute(f"PRAGMA user_version={SCHEMA_VERSION}")
+
+
+def _require_alone(connection: sqlite3.Connection, lock: Lock) -> None:
+    """Refuse a journal that somebody has open under another lock file than the one that was just locked.
+
+    The last writer said which lock file it had. If it is another, having it proves nothing, and SQLite says
+    whether somebody else is there: it leaves the log only for a connection that is alone.
+    """
+    if connection.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
+        return
+    with suppress(sqlite3.Error):
+        if connection.execute("SELECT lock FROM writer").fetchone() == (str(lock.identity),):
+            return
+    with suppress(sqlite3.OperationalError):
+        if connection.execute("PRAGMA journal_mode=DELETE").fetchone()[0] != "wal":
+            return
+    raise JournalBusy(
+        f"{lock.path} is open elsewhere, and its lock file is not the one that it was opened with: somebody "
+        "deleted or moved it; close what has the journal open"
+    )
 
 
 def _refuse_foreign(path: Path) -> None:
     """Refuse a file that is not a readable journal before anything is written to it or next to it."""
     if path.exists() and not path.is_file():
         raise JournalError(f"{path} is not a file")
-    if not path.exists() or not path.stat().st_size:
+    if not path.exists():
         return
-    with _explained(path, "be read as a journal of learning sessions"):
-        # Immutable: SQLite then neither locks, nor recovers, nor makes a file.
-        connection = _connect(path, "ro&immutable=1")
-        try:
-            _require_readable(connection, path)
-        finally:
-            connection.close()
+    with explained(path, "be read as a journal of learning sessions"):
+        header = header_of(path)
+    if not header:
+        return
+    if (len(header) < HEADER_SIZE and _MAGIC.startswith(header[: len(_MAGIC)])) or not any(header):
+        with suppress(OSError), open(path.with_name(f"{path.name}-journal"), "rb") as undo:
+            if undo.read(len(_UNDO_MAGIC)) == _UNDO_MAGIC:
+                return  # the first write to a new file was cut short, as by a full disk: SQLite will undo it
+    if len(header) < HEADER_SIZE or not header.startswith(_MAGIC):
+        raise JournalError(f"{path} cannot be read as a journal of learning sessions: it is no SQLite file")
+    version, application = (int.from_bytes(header[at : at + 4], "big") for at in (60, 68))
+    _require_ours(application, version, path)
 
 
 def _require_readable(connection: sqlite3.Connection, path: Path) -> None:
-    if connection.execute("PRAGMA application_id").fetchone()[0] != APPLICATION_ID:
+    application = connection.execute("PRAGMA application_id").fetchone()[0]
+    _require_ours(application, connection.execute("PRAGMA user_version").fetchone()[0], path)
+
+
+def _require_ours(application: int, version: int, path: Path) -> None:
+    if application != APPLICATION_ID:
         raise JournalError(f"{path} is not a journal of learning sessions")
-    version = connection.execute("PRAGMA user_version").fetchone()[0]
-    if version > SCHEMA_VERSION:
+    if not 1 <= version <= SCHEMA_VERSION:
         raise JournalError(
             f"{path} was written by a newer i2rl (journal version {version}; this one reads up to "
             f"{SCHEMA_VERSION}): update i2rl to use it"

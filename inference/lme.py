@@ -28,7 +28,7 @@ from ..models.planning import SoftPlan, require_discounted, reward_of, soft_plan
 from .maxent import Solution, WarmStart, exponentiated_gradient, fit_counts, solve_dual
 from .maxent_constraints import FeatureTarget
 from .schedule import Schedule, described, program_slack, require_slack, require_slack_in
-from .session import Learner, Report
+from .session import Learner, Report, as_key
 from .smoothing import Evidence, blocked_posterior, evidence_of, gibbs_posterior, smooth_all
 from .statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
 
@@ -436,7 +436,7 @@ def _learner(
             return closing(state, point, program, evidence, seen)
 
     def init(key: Array) -> LMEState:
-        key, fresh = jax.random.split(key)
+        key, fresh = jax.random.split(as_key(key))
         weights = _random_weights(fresh, mdp)
         return LMEState(
             weights,

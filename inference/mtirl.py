@@ -36,7 +36,7 @@ from .mixture_fit import (
     nothing_kept,
 )
 from .mixture_search import Search, search
-from .session import Learner, in_plain_numbers
+from .session import Learner, as_key, in_plain_numbers
 
 DEFAULT_WAYS = 4
 DEFAULT_RESTARTS = 4
@@ -183,7 +183,7 @@ def mme_mtirl(
 
     def init(key: Array) -> MixtureState:
         empty, kept = empty_mixture(mdp, ways), nothing_kept(mdp, ways)
-        return MixtureState(*empty, *kept, jnp.zeros((), int), key)
+        return MixtureState(*empty, *kept, jnp.zeros((), int), as_key(key))
 
     def update(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
         began = time.perf_counter()

@@ -42,7 +42,7 @@ from .discriminator import Discriminator, Losses, Transitions, cross_entropy
 from .discriminator_training import Objective, discriminator_updates
 from .ppo import PPO, PPOState
 from .rollouts import Running, finished_returns, roll_out
-from .session import Learner
+from .session import Learner, as_key
 from .truth_sampling import reported_steps, within_bounds
 
 if TYPE_CHECKING:
@@ -277,7 +277,7 @@ def noisy_airl(
         return discriminator.rewards(network, policy, _within(task.actions, noisy.steps("intended")))
 
     def init(key: Array) -> AdversarialState:
-        k_network, k_agent, key = jax.random.split(key, 3)
+        k_network, k_agent, key = jax.random.split(as_key(key), 3)
         network = discriminator.init(k_network)
         zero = jnp.zeros((), jnp.int64)
         return AdversarialState(

@@ -43,7 +43,7 @@ from .perception import (
 from .programs import host_solver
 from .reports import report_classes, report_log_evidence
 from .schedule import Schedule, described, require_slack_in
-from .session import Learner, in_plain_numbers
+from .session import Learner, as_key, in_plain_numbers
 from .smoothing import Evidence, smooth_all
 from .statistic import blend, complete
 
@@ -487,7 +487,7 @@ def _learner(
         run, warm = _outside(parts, iterations, tolerance)
 
     def init(key: Array) -> RIMEOState:
-        key, fresh = jax.random.split(key)
+        key, fresh = jax.random.split(as_key(key))
         return RIMEOState(
             _random_weights(fresh, mdp), method.statistic.empty(mdp), jnp.zeros(mdp.n_states), first_logits,
             perception.empty, warm, jnp.zeros((), int), key,

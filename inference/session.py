@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple, Protocol, TypeVar
 
@@ -23,6 +23,8 @@ from jaxtyping import Array, Float, Int
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import deterministic_policy, hard_plan, policy_values, reward_of
+from ..models.text import shortened
+from .serialization import demonstration_digest
 
 if TYPE_CHECKING:
     from .journal import Journal
@@ -103,6 +105,19 @@ class Learner(NamedTuple):
         return hashlib.sha256(content.encode()).hexdigest()
 
 
+def as_key(key: Any) -> Array:
+    """Return one typed random key; a legacy one (``jax.random.PRNGKey``) becomes the key that draws the same.
+
+    Raises ``TypeError`` for what is not one random key.
+    """
+    if isinstance(key, jax.Array | np.ndarray):
+        if jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0:
+            return jnp.asarray(key)
+        if key.dtype == np.uint32 and key.ndim == 1:
+            return jax.random.wrap_key_data(jnp.asarray(key))
+    raise TypeError(f"`key` must be one random key, such as jax.random.key(0); got {shortened(key)}")
+
+
 class Fleet(NamedTuple):
     """One learner on many independent streams: states and demonstrations with a leading axis."""
 
@@ -135,7 +150,7 @@ def fleet(learner: Learner) -> Fleet:
         )
 
     init = jax.vmap(learner.init)
-    return Fleet(lambda key, streams: init(jax.random.split(key, streams)), update)
+    return Fleet(lambda key, streams: init(jax.random.split(as_key(key), streams)), update)
 
 
 def run_streams(
@@ -167,7 +182,7 @@ def run_streams(
         start, stream = inputs
         return lax.scan(step, init(start), stream)
 
-    inputs = (jax.random.split(key, shape[0]), jax.tree.map(jnp.asarray, demonstrations))
+    inputs = (jax.random.split(as_key(key), shape[0]), jax.tree.map(jnp.asarray, demonstrations))
     return jax.jit(partial(lax.map, one))(inputs)
 
 
@@ -302,16 +317,42 @@ def run_sessions(
     stop: StoppingCriterion | None = None,
     journal: Journal | None = None,
     on_session: Callable[[Any, Report], None] | None = None,
+    whole: bool | None = None,
 ) -> Run:
     """Run one session per demonstration of the stream until it ends or ``stop`` says so (Definition 7).
 
     Starts from ``state``, or where ``journal`` left off, or from ``learner.init(key)``. With a journal every
-    session is committed before the next one begins; the stream must then hold only what is not yet in it.
-    ``on_session`` is called after each session; ``stop`` sees the reports of this run. Raises ``ValueError``
-    if neither key, state nor a journal with sessions is given, for a journal of another learner or with
-    other sessions than ``state``, and whatever ``update`` raises (the state before it stays valid).
+    session is committed before the next one begins, with a digest of its demonstration, so that no session
+    is learned twice.
+
+    Parameters
+    ----------
+    stop : callable, optional
+        Sees the reports of this run.
+    on_session : callable, optional
+        Is called after each session.
+    whole : bool, optional
+        Where the stream begins, once the journal has sessions. True: with the first session's demonstration.
+        Those that the journal has are compared, one by one, and skipped. False: after the last session.
+        By default the first demonstration decides. The one of session 1: True. One that no session learned
+        from: False, and a later one that is the session's at the same place is refused. One of another
+        session is refused. A journal that does not know its demonstrations (of version 1, or committed
+        without digests) is continued: False.
+
+    Raises
+    ------
+    TypeError
+        An argument is no key, no journal, or no iterable of demonstrations.
+    ValueError
+        Neither key, state nor a journal with sessions is given; the journal is another learner's or has other
+        sessions than ``state``; or the stream is not the one that the journal learned from.
+
+    Whatever ``update`` raises passes through; the state before it stays valid.
     """
+    _require_stream(stream)
     if journal is not None:
+        if not hasattr(journal, "commit"):
+            raise TypeError(f"`journal` must be Journal.open(path, learner); got {shortened(journal)}")
         if journal.origin.signature != learner.signature:
             raise ValueError(f"{journal.path} was opened for another learner than {learner.name}")
         if state is not None and int(state.session) != journal.session:
@@ -324,16 +365,63 @@ def run_sessions(
             raise ValueError("run_sessions needs a key, a state or a journal to start from")
         state = learner.init(key)
     reports: list[Report] = []
-    for demonstration in stream:
+    unlearned = ((one, b"") for one in stream) if journal is None else _unlearned(stream, journal, whole)
+    for demonstration, digest in unlearned:
         state, report = learner.update(state, demonstration)
         reports.append(report)
         if journal is not None:
-            journal.commit(state, report)
+            journal.commit(state, report, demonstration=digest)
         if on_session is not None:
             on_session(state, report)
         if stop is not None and stop(reports):
             return Run(state, tuple(reports), True)
     return Run(state, tuple(reports), False)
+
+
+def _require_stream(stream: Any) -> None:
+    if isinstance(stream, tuple) and hasattr(stream, "_fields"):
+        name = type(stream).__name__
+        several = f", {name}.sessions() for one a trajectory" if hasattr(stream, "sessions") else ""
+        advice = f"pass [it] for one session{several}"
+        raise TypeError(f"`stream` must be an iterable of demonstrations; got one {name}: {advice}")
+    if not isinstance(stream, Iterable) or isinstance(stream, str | bytes | Mapping):
+        raise TypeError(f"`stream` must be an iterable of demonstrations; got {shortened(stream)}")
+
+
+def _unlearned(
+    stream: Iterable[Demonstration], journal: Journal, whole: bool | None
+) -> Iterator[tuple[Demonstration, bytes]]:
+    """Demonstrations that the journal has no session of, with their digests."""
+    learned, given, decide = journal.session, 0, whole is None
+    advice = "give the whole stream, or with whole=False what comes after it"
+    for given, demonstration in enumerate(stream, start=1):
+        digest = demonstration_digest(demonstration)
+        if given == 1 and decide and learned:
+            whole = journal.demonstration(1) == digest
+            if not whole and (session := journal.learned_from(digest)) is not None:
+                raise ValueError(
+                    f"the stream must begin with session 1 or after session {learned} of {journal.path}; it "
+                    f"begins with the demonstration of session {session}: {advice}"
+                )
+        known = journal.demonstration(given) if given <= learned else b""
+        if whole and given <= learned:
+            if known and known != digest:
+                raise ValueError(
+                    f"demonstration {given} of the stream is not the one that session {given} of "
+                    f"{journal.path} learned from: {advice}"
+                )
+            continue
+        if decide and known and known == digest:
+            raise ValueError(
+                f"demonstration {given} of the stream is the one that session {given} of {journal.path} "
+                f"learned from, but demonstration 1 is not that of session 1: {advice}"
+            )
+        yield demonstration, digest
+    if whole and given < learned:
+        raise ValueError(
+            f"the stream ends after {given} demonstrations, but {journal.path} has {learned} sessions: "
+            f"{advice}"
+        )
 
 
 def average_regret(

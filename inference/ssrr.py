@@ -28,7 +28,7 @@ from .discriminator import Discriminator
 from .noisy_airl import NoisyRollout, NoisyTraining, noisy_airl, roll_out_noisily
 from .ppo import PPO, PPOState
 from .rollouts import begin, finished_returns
-from .session import Learner
+from .session import Learner, as_key
 from .snippet_regression import Ranked, Regression, SSRRReward, snippet_regression
 from .truth_sampling import reported_steps
 
@@ -317,7 +317,7 @@ def ssrr(
         return network(rollout.observations)
 
     def init(key: Array) -> SSRRState:
-        k_first, k_network, k_agent, key = jax.random.split(key, 4)
+        k_first, k_network, k_agent, key = jax.random.split(as_key(key), 4)
         network = SSRRReward.create(k_network, environment.observation_size, how.regression)
         return SSRRState(
             session=jnp.zeros((), jnp.int64),

@@ -3,9 +3,11 @@ import json
 import os
 import re
 import signal
+import sqlite3
 import subprocess
 import sys
 import typing
+from typing import NamedTuple
 
 import arviz
 import jax
@@ -308,6 +310,85 @@ def test_only_the_last_sessions_are_listed(house):
     assert listed == ["3", "4"]
 
 
+def test_no_more_sessions_are_read_than_are_shown(house):
+    call(*options(house))
+    with sqlite3.connect(house / "learned.db") as connection:
+        connection.execute("UPDATE session SET report = x'00' WHERE number = 1")
+    connection.close()
+    assert "3" in call("show", house / "learned.db", "--last", 2).stdout
+    sessions = json.loads(call("show", house / "learned.db", "--last", 2, "--json").stdout)["sessions"]
+    assert [session["session"] for session in sessions] == [3, 4]
+    for all_of_it in (["--last", 4], ["--verify"], ["--export", house / "history.nc"]):
+        assert "session 1 cannot be read: the bytes are damaged" in refused(
+            "show", house / "learned.db", *all_of_it
+        )
+
+
+def test_a_journal_is_verified(house):
+    call(*options(house))
+    assert (
+        call("show", house / "learned.db", "--verify").stderr
+        == "All 4 sessions are as they were committed.\n"
+    )
+
+
+def test_a_journal_of_several_rewards_and_other_reports_is_shown(tmp_path):
+    class State(NamedTuple):
+        weights: np.ndarray
+        session: int
+
+    class Report(NamedTuple):
+        log_likelihood: float
+        components: np.ndarray
+
+    learner = lme_i2rl(circle(), Visibility(IN_VIEW))
+    with Journal.open(tmp_path / "two.db", learner) as journal:
+        journal.commit(State(np.array([[1.0, -2.0], [0.25, 0.0]]), 1), Report(-1.5, np.ones(2)))
+    shown = call("show", tmp_path / "two.db").stdout
+    assert re.search(r"goes on +│ +1.000 │ +0.333 │ +0.250 │ +1.000 │", shown)
+    assert re.search(r"│ +1 │ +-1.5000 │", shown)
+
+
+def test_bad_lines_are_set_aside_and_counted(house):
+    bad = [
+        "no JSON\n",
+        '{"steps": [{"s": "attic"}]}\n',
+        "[" + ", ".join(['"hidden"'] * 9) + "]\n",
+        "[" + " " * 999 + "]\n",
+    ]
+    mixed = [x for pair in zip(LINES, bad, strict=True) for x in pair]
+    (house / "demos.jsonl").write_text("".join(mixed[:3]))
+    asked = [*options(house, quarantine=house / "bad.jsonl", line_steps=8, line_bytes=900)]
+    assert (
+        call(*asked).stderr.replace("\n", "") == f"Lines set aside in {house / 'bad.jsonl'}: 1 new, 1 in all."
+    )
+    (house / "demos.jsonl").write_text("".join(mixed))
+    again = call(*asked)
+    assert again.stderr.replace("\n", "") == f"Lines set aside in {house / 'bad.jsonl'}: 3 new, 4 in all."
+    assert "2 sessions learned (2 were in" in again.stdout
+    reasons = [json.loads(line)["reason"] for line in (house / "bad.jsonl").read_text().splitlines()]
+    for reason, expected in zip(
+        reasons,
+        ("not valid JSON", "unknown state 'attic'", "9 steps, more than 8", "more than 900 bytes"),
+        strict=True,
+    ):
+        assert expected in reason
+
+
+@pytest.mark.parametrize("file", ["demos.jsonl", "learned.db"])
+def test_a_quarantine_is_a_file_of_its_own(house, file):
+    call(*options(house))
+    before = (house / file).read_bytes()
+    assert "--quarantine must be a file of its own" in refused(*options(house, quarantine=house / file))
+    assert (house / file).read_bytes() == before
+
+
+def test_a_name_of_ten_megabytes_is_cut_in_the_message(house):
+    (house / "demos.jsonl").write_text('{"steps": [{"s": "' + "x" * 10**7 + '"}]}\n')
+    assert "more than 4,194,304 bytes" in refused(*options(house))
+    assert len(refused(*options(house, line_bytes=10**8))) < 1100
+
+
 # -- mistakes ---------------------------------------------------------------------------------------------
 
 
@@ -441,7 +522,24 @@ def test_a_reader_that_leaves_is_no_error(house, flags):
     shown.stdout.close()  # as head does, only sooner
     assert shown.stderr.read() == b""
     shown.stderr.close()
-    shown.wait(timeout=60)
+    assert shown.wait(timeout=60) == 141  # as of a tool that SIGPIPE ends
+
+
+def test_a_learner_whose_reader_leaves_says_what_is_safe_and_goes_on_when_run_again(house):
+    (house / "demos.jsonl").write_text("".join(LINES * 20))
+    command = [*COMMAND, *options(house), "--json"]
+    learner = subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    assert json.loads(learner.stdout.readline())["session"] == 1
+    learner.stdout.close()
+    told = learner.stderr.read()
+    learner.stderr.close()
+    assert learner.wait(timeout=60) == 141, told
+    found = re.fullmatch(
+        r"The output's reader went away; (\d+) sessions are in .*learned\.db\. Run again to go on\.\n", told
+    )
+    with Journal.read(house / "learned.db") as view:
+        assert view.session == int(found[1]) < 80
+    assert f"{80 - int(found[1])} sessions learned ({found[1]} were in" in call(*options(house)).stdout
 
 
 # -- the study --------------------------------------------------------------------------------------------

@@ -136,7 +136,7 @@ def test_a_run_resumed_from_its_journal_equals_an_uninterrupted_one_to_the_bit(
     with Journal.open(tmp_path / "run.journal", learner) as journal:
         run_sessions(learner, [reports] * 2, key=jax.random.key(0), journal=journal)
     with Journal.open(tmp_path / "run.journal", learner) as journal:
-        resumed = run_sessions(learner, [reports], journal=journal).state
+        resumed = run_sessions(learner, [reports] * 3, journal=journal).state
 
     def bits(x) -> bytes:
         x = jax.random.key_data(x) if jax.dtypes.issubdtype(x.dtype, jax.dtypes.prng_key) else x

@@ -1,3 +1,5 @@
+from typing import NamedTuple
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,14 +11,18 @@ from i2rl.inference import (
     MovingWindow,
     PolicyWindow,
     Report,
+    airl_tabular,
     average_regret,
     fleet,
     lme_i2rl,
     me_i2rl,
+    mme_mtirl,
     run_sessions,
     run_streams,
 )
+from i2rl.inference.jin import jin_i2rl
 from i2rl.inference.journal import Journal
+from i2rl.inference.serialization import demonstration_digest
 from i2rl.models import (
     Demonstration,
     Sensor,
@@ -235,3 +241,167 @@ def test_a_journal_of_another_learner_or_of_other_sessions_is_refused(world, str
         fresh = learner.init(jax.random.key(0))
         with pytest.raises(ValueError, match=r"0 sessions, but .* has 2"):
             run_sessions(learner, stream.sessions(), state=fresh, journal=journal)
+
+
+# -- resuming from a journal ------------------------------------------------------------------------------
+
+
+class Tally:
+    """A learner that adds up what it is shown, so that learning twice shows."""
+
+    name, signature, configuration = "tally", "t", {}
+
+    def __init__(self, mdp):
+        self.mdp = mdp
+
+    def init(self, key):
+        return Added(np.zeros(2), 0)
+
+    def update(self, state, demonstration):
+        state = Added(state.weights + np.asarray(demonstration, float), state.session + 1)
+        return state, report(state.session, weights=state.weights)
+
+
+class Added(NamedTuple):
+    weights: np.ndarray
+    session: int
+
+
+FIVE = [np.array([i, 1]) for i in (3, 1, 1, 4, 2)]
+
+
+@pytest.fixture
+def begun(random_mdp, tmp_path):
+    """A function that runs a learner on a stream, in one journal; it has learned from three of five."""
+    learner = Tally(random_mdp(0))
+
+    def run(stream, **options):
+        with Journal.open(tmp_path / "j", learner) as journal:
+            return run_sessions(learner, stream, key=jax.random.key(0), journal=journal, **options)
+
+    assert run(FIVE[:3]).state.weights.tolist() == [5, 3]
+    return run
+
+
+@pytest.mark.parametrize(
+    ("stream", "options"), [(FIVE, {}), (FIVE, {"whole": True}), (FIVE[3:], {"whole": False})]
+)
+def test_a_stream_is_learned_once_however_it_is_given_again(begun, stream, options):
+    run = begun(stream, **options)
+    assert run.state.weights.tolist() == [11, 5]
+    assert [r.session for r in run.reports] == [4, 5]
+    assert begun(iter(FIVE)).reports == ()
+
+
+def test_what_no_session_learned_from_is_what_comes_next(begun):
+    assert begun(FIVE[3:]).state.weights.tolist() == [11, 5]
+    assert begun([]).state.session == 5
+    with pytest.raises(ValueError, match=r"after session 5 .* begins with the demonstration of session 4"):
+        begun(FIVE[3:])  # twice would be learned twice
+    assert begun(FIVE[3:], whole=False).state.weights.tolist() == [17, 7]
+
+
+@pytest.mark.parametrize(
+    ("stream", "options", "message", "learned"),
+    [
+        (
+            FIVE[1:],
+            {},
+            "must begin with session 1 or after session 3 .* of session 2: give the whole stream",
+            3,
+        ),
+        (
+            [FIVE[0], FIVE[0], *FIVE[2:]],
+            {},
+            "demonstration 2 of the stream is not the one that session 2 of .*j",
+            3,
+        ),
+        (FIVE[::-1], {"whole": True}, "demonstration 1 of the stream is not the one that session 1", 3),
+        (FIVE[:2], {}, "the stream ends after 2 demonstrations, but .*j has 3 sessions", 3),
+        # An edited first demonstration is taken for something new, but what follows gives it away.
+        ([9 * FIVE[0], *FIVE[1:]], {}, "demonstration 2 of the stream is the one that session 2", 4),
+    ],
+)
+def test_another_stream_is_refused_and_not_learned_from(begun, stream, options, message, learned):
+    with pytest.raises(ValueError, match=message):
+        begun(stream, **options)
+    assert begun([], whole=False).state.session == learned
+
+
+def test_a_journal_that_does_not_know_its_demonstrations_is_continued(random_mdp, tmp_path):
+    learner = Tally(random_mdp(0))
+    with Journal.open(tmp_path / "j", learner) as journal:
+        journal.commit(*learner.update(learner.init(None), FIVE[0]))
+        assert run_sessions(learner, FIVE[1:], journal=journal).state.weights.tolist() == [11, 5]
+
+
+def test_a_demonstration_has_one_digest_whatever_holds_it():
+    steps = Demonstration.from_pairs([[0, 1]], [[1, 0]])
+    padded = steps.padded(4, 8)
+    as_jax = jax.tree.map(jnp.asarray, steps)
+    wide = steps._replace(state=steps.state.astype(np.int64), score=np.array([[-np.nan, np.nan]]))
+    assert (
+        len(
+            {
+                demonstration_digest(x)
+                for x in (steps, padded, as_jax, wide, jax.tree.map(jnp.asarray, padded))
+            }
+        )
+        == 1
+    )
+    others = [
+        Demonstration.from_pairs([[0, 1]], [[1, 1]]),
+        Demonstration.from_pairs([[0], [1]], [[1], [0]]),
+        steps._replace(score=np.array([[0.5, np.nan]])),
+        steps._replace(kind=np.array([[2, 1]])),
+        steps.select([]),
+    ]
+    assert len({demonstration_digest(x) for x in (steps, *others)}) == 6
+
+
+# -- mistakes ---------------------------------------------------------------------------------------------
+
+
+def test_what_is_no_stream_no_key_and_no_journal_is_named(world, stream, tmp_path):
+    learner, key = lme_i2rl(*world), jax.random.key(0)
+    mistakes = {
+        r"got one Demonstration: pass \[it\] for one session, Demonstration.sessions\(\) for one": stream,
+        "`stream` must be an iterable of demonstrations; got 'demos.jsonl'": "demos.jsonl",
+        "`stream` must be an iterable of demonstrations; got 3": 3,
+    }
+    for message, wrong in mistakes.items():
+        with pytest.raises(TypeError, match=message):
+            run_sessions(learner, wrong, key=key)
+    with pytest.raises(TypeError, match=r"`journal` must be Journal.open\(path, learner\); got 'run.db'"):
+        run_sessions(learner, stream.sessions(), key=key, journal="run.db")
+    for wrong in (0, np.zeros(2), jax.random.split(key), "seed"):
+        with pytest.raises(
+            TypeError, match=r"`key` must be one random key, such as jax.random.key\(0\); got "
+        ):
+            run_sessions(learner, stream.sessions(), key=wrong)
+        with pytest.raises(TypeError, match="`key` must be one random key"):
+            fleet(learner).init(wrong, 2)
+
+
+def test_a_legacy_key_begins_as_the_typed_one_does(world):
+    mdp, sensor = world
+    legacy, typed = jax.random.PRNGKey(5), jax.random.key(5)
+    for learner in (lme_i2rl(mdp, sensor), jin_i2rl(mdp), mme_mtirl(mdp, sensor), airl_tabular(mdp)):
+        one, other = learner.init(legacy), learner.init(typed)
+        assert jax.tree.structure(one) == jax.tree.structure(other)
+        for a, b in zip(jax.tree.leaves(one), jax.tree.leaves(other), strict=True):
+            assert a.dtype == b.dtype
+            assert np.array_equal(*(jax.random.key_data(x) if x.dtype == typed.dtype else x for x in (a, b)))
+
+
+def test_a_journal_begun_with_a_legacy_key_resumes(world, stream, tmp_path):
+    learner = lme_i2rl(*world)
+    demonstrations = list(stream.select([0, 1]).sessions())
+    whole = run_sessions(learner, demonstrations, key=jax.random.key(0)).state
+    for count in (1, 2):
+        with Journal.open(tmp_path / "a.db", learner) as journal:
+            state = run_sessions(
+                learner, demonstrations[:count], key=jax.random.PRNGKey(0), journal=journal
+            ).state
+    assert np.array_equal(state.weights, whole.weights)
+    assert state.key == whole.key

@@ -1,16 +1,21 @@
 import itertools
 import json
+import re
 import threading
 import time
+import tracemalloc
 from collections.abc import Iterable, Iterator
 
 import jax
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from i2rl.analysis.benchmarks.kills import content, survive
-from i2rl.analysis.stream import follow_lines, learn_stream, open_lines
-from i2rl.inference.journal import Journal, JournalError
+from i2rl.analysis.quarantine import Line, Quarantine
+from i2rl.analysis.stream import Limits, followed, learn_stream, open_lines, read_lines
+from i2rl.inference.journal import Journal, JournalError, Position
 from i2rl.inference.lme import lme_i2rl
 from i2rl.models import DemonstrationError, TabularMDP, Visibility, concatenate, read_trajectories
 from i2rl.models.storage import save_mdp
@@ -161,8 +166,10 @@ def test_there_is_nothing_to_learn_from_an_empty_input(learner, tmp_path):
 def test_another_input_is_refused_and_the_journal_stays(learner, lines, tmp_path):
     learn(learner, lines[:4], tmp_path / "j")
     kept = content(tmp_path / "j")
-    with pytest.raises(JournalError, match="the first 4 lines of the input are not those"):
-        learn(learner, [lines[1], *lines[1:]], tmp_path / "j")
+    with pytest.raises(JournalError, match="lines 1 to 1 of the input are not those that were learned from"):
+        learn(learner, interrupted([lines[1]]), tmp_path / "j")  # without waiting for the others
+    with pytest.raises(JournalError, match="lines 1 to 4 of the input are not those that were learned from"):
+        learn(learner, [lines[0], lines[0], *lines[2:]], tmp_path / "j")
     with pytest.raises(JournalError, match="ends after 2 lines, but 4 were already learned from"):
         learn(learner, lines[:2], tmp_path / "j")
     assert content(tmp_path / "j") == kept
@@ -199,13 +206,57 @@ def test_an_impossible_session_names_its_lines(learner, lines, tmp_path):
     assert len(content(tmp_path / "j").sessions) == 1
 
 
-def test_a_line_that_is_not_text_is_named(tmp_path):
+def test_a_line_that_is_not_text_is_named(learner, tmp_path):
     (tmp_path / "demos.jsonl").write_bytes(b'{"steps": ["hidden"]}\n{"steps": ["\xff"]}\n')
     opened, source = open_lines(str(tmp_path / "demos.jsonl"), follow=False)
-    assert source == "demos.jsonl"
-    assert next(iter(opened)) == '{"steps": ["hidden"]}\n'
     with pytest.raises(DemonstrationError, match=r"demos.jsonl, line 2: not UTF-8 text at byte 13"):
-        next(iter(opened))
+        learn(learner, opened, tmp_path / "j", source=source)
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.lists(st.text("ab\r\u00fc", max_size=6), max_size=5), st.booleans(), st.data())
+def test_lines_come_out_of_any_pieces_with_their_positions(texts, ends, data):
+    whole = ("\n".join(texts) + "\n" * ends).encode()
+    cuts = sorted({0, len(whole), *data.draw(st.lists(st.integers(0, len(whole)), max_size=5))})
+    pieces = [p for a, b in itertools.pairwise(cuts) for p in whole[a:b].splitlines(keepends=True) if p]
+    pieces = [q for p in pieces for q in re.findall(rb"[^\n]*\n|[^\n]+", p)]
+    position = Position()
+    expected = re.findall(r"[^\n]*\n|[^\n]+", whole.decode())
+    for line, text in zip(read_lines(pieces, "input"), expected, strict=True):
+        position = position.after(text)
+        assert line == Line(text, position)
+
+
+def test_of_a_line_without_end_only_the_beginning_is_held():
+    def pieces(count: int) -> Iterator[bytes]:
+        yield b"first\n"
+        yield from itertools.repeat(b"x" * (1 << 16), count)
+        yield from (b"\n", b"last\n")
+
+    limits = Limits(line_bytes=100_000)
+    tracemalloc.start()
+    found = list(read_lines(pieces(1000), "demos.jsonl", limits, skip=True))
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1e6  # of 65 MB
+    assert [line.text[:5] for line in found] == ["first", "xxxxx", "last\n"]
+    assert found[1].fault.startswith("the line has more than 100,000 bytes")
+    # Its position is that of the whole line, so that it may be read in another run that allows more.
+    more = list(read_lines(pieces(1000), "demos.jsonl", Limits(line_bytes=1 << 30)))
+    assert [line.position for line in more] == [line.position for line in found]
+    with pytest.raises(
+        DemonstrationError, match=r"demos.jsonl, line 2: the line has more than 100,000 bytes \(.*--line"
+    ):
+        list(read_lines(itertools.chain([b"first\n"], itertools.repeat(b"x" * 1000)), "demos.jsonl", limits))
+
+
+def test_a_trajectory_of_too_many_steps_is_refused_unless_it_is_allowed(learner, tmp_path):
+    steps = json.dumps(["hidden"] * 5) + "\n"
+    with pytest.raises(
+        DemonstrationError, match=r"input, line 1: the trajectory has 5 steps, more than 4 \(.*--line-st"
+    ):
+        learn(learner, [steps], tmp_path / "j", limits=Limits(line_steps=4))
+    assert learn(learner, [steps], tmp_path / "j", limits=Limits(line_steps=5)) == 1
 
 
 def test_a_line_cut_off_is_learned_once_it_is_whole(learner, lines, tmp_path):
@@ -247,6 +298,121 @@ def test_a_full_disk_keeps_the_sessions_before_it(learner, lines, tmp_path):
     assert content(tmp_path / "j") == whole
 
 
+# -- bad lines, set aside ---------------------------------------------------------------------------------
+
+BAD = [
+    '{"steps": [\n',
+    '{"steps": ["hidden", {"s": "attic"}]}\n',
+    STEP_INTO_THE_UNSEEN,
+    '{"steps": ["' + "x" * 500 + '"]}\n',
+    json.dumps(["hidden"] * 30) + "\n",
+    JUMP,
+]
+FEW = Limits(line_bytes=400, line_steps=20)
+REASONS = [
+    "not valid JSON", "unknown state 'attic'", "trajectory 0, step 1: ", "more than 400 bytes",
+    "30 steps, more than 20", "trajectory [01], step 2: ",
+]  # fmt: skip
+
+
+def spoilt(lines: list[str]) -> list[str]:
+    """The lines, with a bad one after each of the first six."""
+    return [x for i, line in enumerate(lines) for x in (line, *BAD[i : i + 1])]
+
+
+def pieces_of(lines: Iterable[str]) -> Iterator[Line]:
+    return read_lines((line.encode() for line in lines), "demos.jsonl", FEW, skip=True)
+
+
+def set_aside(learner, lines: Iterable[str], folder, **options) -> tuple[int, Quarantine]:
+    quarantine = Quarantine(folder / "bad.jsonl")
+    options = {"limits": FEW, "source": "demos.jsonl", "quarantine": quarantine} | options
+    return learn(learner, pieces_of(lines), folder / "j", **options), quarantine
+
+
+def entries(folder) -> list[dict]:
+    return [json.loads(line) for line in (folder / "bad.jsonl").read_text().splitlines()]
+
+
+@pytest.mark.parametrize("size", [1, 2])
+def test_bad_lines_are_set_aside_and_the_good_ones_learned(learner, lines, size, tmp_path):
+    sessions = learn(learner, lines, tmp_path / "good", size=size)
+    stream = spoilt(lines)
+    done, quarantine = set_aside(learner, stream, tmp_path, size=size)
+    assert done == sessions
+    assert (quarantine.added, quarantine.lines) == (6, 6)
+    good, found = content(tmp_path / "good"), content(tmp_path / "j")
+    assert found.state == good.state
+    assert [s[:2] for s in found.sessions] == [s[:2] for s in good.sessions]
+    aside = sorted(entries(tmp_path), key=lambda entry: entry["line"])
+    assert [entry["line"] for entry in aside] == [2, 4, 6, 8, 10, 12]
+    for entry, line, reason in zip(aside, BAD, REASONS, strict=True):
+        assert re.search(reason, entry["reason"])
+        assert entry["reason"].startswith("demos.jsonl, ")
+        assert entry["source"] == "demos.jsonl"
+        assert entry["text"] == line.rstrip("\n") or (
+            entry["text"].endswith("...") and line.startswith(entry["text"][:99])
+        )
+
+
+def test_a_line_is_set_aside_once_wherever_learning_was_interrupted(learner, lines, tmp_path):
+    stream = spoilt(lines)
+    set_aside(learner, stream, tmp_path, size=2)
+    whole, aside = content(tmp_path / "j"), entries(tmp_path)
+    for k in range(len(stream) + 1):
+        folder = tmp_path / f"{k}"
+        folder.mkdir()
+        with pytest.raises(Interrupted):
+            set_aside(learner, interrupted(stream[:k]), folder, size=2)
+        before = len(entries(folder))
+        with (folder / "bad.jsonl").open("a") as file:
+            file.write('{"digest": "12'[:k])  # what a kill may leave of another line
+        _, quarantine = set_aside(learner, stream, folder, size=2)
+        assert content(folder / "j") == whole
+        assert entries(folder) == aside
+        assert (quarantine.added, quarantine.lines) == (6 - before, 6)
+
+
+def test_if_no_trajectory_is_named_the_whole_session_is_set_aside(learner, lines, tmp_path):
+    class Refusing:
+        def __init__(self, real):
+            self.real = real
+
+        def __getattr__(self, name):
+            return getattr(self.real, name)
+
+        def update(self, state, demonstration):
+            if demonstration.n_trajectories == 2 and state.session == 1:
+                raise DemonstrationError("this cannot be")
+            return self.real.update(state, demonstration)
+
+    good = [line for line in lines if line.strip()]
+    done, quarantine = set_aside(Refusing(learner), good[:7], tmp_path, size=2)
+    assert done == 2  # lines 1, 2; then always two that cannot be; then the last
+    assert quarantine.lines == 4
+
+
+def test_errors_that_are_not_the_lines_own_still_stop(learner, lines, tmp_path):
+    class Failing:
+        def __getattr__(self, name):
+            return getattr(learner, name)
+
+        def update(self, state, demonstration):
+            raise ValueError("a matrix is singular")
+
+    with pytest.raises(ValueError, match=r"demos.jsonl, line 1: a matrix is singular"):
+        set_aside(Failing(), lines, tmp_path)
+    assert entries(tmp_path) == []
+
+
+@pytest.mark.parametrize("text", ["my notes\n", '{"id": 3}\n', '{"digest": "zz", "line": 3}\n'])
+def test_a_file_of_something_else_takes_no_bad_lines(text, tmp_path):
+    (tmp_path / "bad.jsonl").write_text(text)
+    with pytest.raises(ValueError, match=r"bad.jsonl is not a quarantine of lines"):
+        Quarantine(tmp_path / "bad.jsonl")
+    assert (tmp_path / "bad.jsonl").read_text() == text
+
+
 # -- a file that grows ------------------------------------------------------------------------------------
 
 
@@ -272,13 +438,75 @@ def test_lines_are_followed_as_they_become_complete(tmp_path):
     writer = threading.Thread(target=write)
     writer.start()
     read = b""
-    with path.open("rb") as file:
-        for line in itertools.islice(follow_lines(file, poll_seconds=0.001), len(lines)):
-            read += line
-            complete.append(line.decode())
-            assert written >= len(read)  # nothing was made up
+    for line in itertools.islice(whole(followed(str(path), fail, poll_seconds=0.001)), len(lines)):
+        read += line
+        complete.append(line.decode())
+        assert written >= len(read)  # nothing was made up
     writer.join()
     assert complete == lines
+
+
+def fail(message: str) -> None:
+    raise AssertionError(message)
+
+
+def whole(pieces: Iterable[bytes]) -> Iterator[bytes]:
+    """Lines from their pieces."""
+    line = b""
+    for piece in pieces:
+        line += piece
+        if line.endswith(b"\n"):
+            yield line
+            line = b""
+
+
+class Watched:
+    """A file, and what is followed of it."""
+
+    def __init__(self, path) -> None:
+        self.path, self.said = path, []
+        path.write_text("one\ntwo\n")
+        self.lines = whole(followed(str(path), self.said.append, poll_seconds=0.001))
+        assert self.read(2) == ["one", "two"]
+
+    def read(self, count: int) -> list[str]:
+        return [line.decode().rstrip("\n") for line in itertools.islice(self.lines, count)]
+
+
+def test_a_rotated_file_is_read_to_its_end_and_then_the_new_one(tmp_path):
+    watched = Watched(tmp_path / "demos.jsonl")
+    with watched.path.open("a") as old:
+        watched.path.rename(tmp_path / "demos.jsonl.1")
+        print("three", file=old, flush=True)  # by a writer that has not noticed
+        assert watched.read(1) == ["three"]
+        watched.path.write_text("four\nfive\n")
+        print("three and a half", file=old, flush=True)
+    assert watched.read(3) == ["three and a half", "four", "five"]
+    assert watched.said == [
+        f"{watched.path} was replaced: the old file is read to its end, reading the new one from its start"
+    ]
+    watched.path.unlink()
+    watched.path.write_text("six\n")
+    assert watched.read(1) == ["six"]
+
+
+def test_the_last_line_of_a_rotated_file_ends_there(tmp_path):
+    watched = Watched(tmp_path / "demos.jsonl")
+    with watched.path.open("a") as file:
+        file.write("thr")
+    watched.path.rename(tmp_path / "demos.jsonl.1")
+    watched.path.write_text("four\n")
+    assert watched.read(2) == ["thr", "four"]
+
+
+@pytest.mark.parametrize(
+    "text", ["1\n", "another line altogether\nand one more\n"], ids=["shorter", "longer"]
+)
+def test_a_file_written_anew_is_read_from_its_start(text, tmp_path):
+    watched = Watched(tmp_path / "demos.jsonl")
+    watched.path.write_text(text)  # the same file, truncated first
+    assert watched.read(text.count("\n")) == text.splitlines()
+    assert watched.said == [f"{watched.path} was cut off or written anew: reading it from its start"]
 
 
 def test_a_growing_file_is_learned_from_while_it_grows(learner, lines, tmp_path):
@@ -316,12 +544,12 @@ def test_a_killed_learner_loses_no_session_and_repeats_none(learner, lines, tmp_
         "--seed",
         "3",
     ]
-    shares = {"starting": 1, "sessions": 2, "closing": 1}
-    survival = survive(arguments, tmp_path, kills=4, shares=shares)
+    shares = {"starting": 4, "sessions": 10, "closing": 1}
+    survival = survive(arguments, tmp_path, kills=30, shares=shares, forked=True)
     assert survival.problems == ()
     assert survival.sessions == 28
-    assert len(survival.kills) == 4
-    assert any(0 < k.committed < survival.sessions for k in survival.kills)
+    assert len(survival.kills) == 30
+    assert sum(0 < k.committed < survival.sessions for k in survival.kills) > 15
     # Nor does it matter that each of these was another process.
     learn(learner, lines * 4, tmp_path / "here")
     assert content(tmp_path / "here") == content(tmp_path / "life-1.db")

@@ -15,23 +15,29 @@ milliseconds. So a life's kills are shared out over the phases, and are uniform 
   reporting are all met as often as they take time;
 - closing: after the last session, and once more in a run that finds nothing left to do.
 
+Processes may be forked from one that has imported everything: a kill then costs about half of the time, and
+none of them meets the imports, during which no file is open.
+
 A kill ends the process and not the system: what power loss leaves is SQLite's matter and not measured here.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import select
 import shutil
+import signal
 import sqlite3
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -124,52 +130,193 @@ def content(path: Path) -> Content:
             )
             for record in view.reports()
         ]
-    connection = sqlite3.connect(path)
+        state = [(name, str(value.dtype), value.tobytes()) for name, value in _arrays(view.stored_state())]
+        return Content(sessions, [(view.session, state)] if state else [])
+
+
+def _arrays(leaves: Mapping[str, Any]) -> Iterator[tuple[str, np.ndarray]]:
+    return ((name, np.asarray("" if value is None else value)) for name, value in leaves.items())
+
+
+# -- processes --------------------------------------------------------------------------------------------
+
+
+class Started(Protocol):
+    """A learner that runs: what it prints, a line a session, and the power to kill it."""
+
+    @property
+    def output(self) -> int:
+        """The descriptor to read that from."""
+
+    def kill(self) -> None:
+        """End it with SIGKILL."""
+
+    def wait(self) -> tuple[int, str]:
+        """Its exit status, and what it said on standard error."""
+
+
+Start = Callable[[Sequence[str], bool], Started]
+"""Starts ``i2rl`` with arguments, with the cache of compiled code or without."""
+
+
+class _Process:
+    def __init__(self, command: Sequence[str], environment: Mapping[str, str]) -> None:
+        self._said = tempfile.TemporaryFile()  # noqa: SIM115 (open until it has been read)
+        self._child = subprocess.Popen(
+            command, env=dict(environment), stdout=subprocess.PIPE, stderr=self._said
+        )
+        assert self._child.stdout is not None
+        self.output = self._child.stdout.fileno()
+
+    def kill(self) -> None:
+        self._child.kill()
+
+    def wait(self) -> tuple[int, str]:
+        status = self._child.wait()
+        self._child.communicate()
+        self._said.seek(0)
+        return status, self._said.read().decode()
+
+
+def processes(compiled: Path) -> Start:
+    """Start a process of its own each time; ``compiled`` is the folder of the cache."""
+    cold = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
+    warm = cold | {name.upper(): str(value) for name, value in _cache(compiled).items()}
+
+    def start(arguments: Sequence[str], cached: bool) -> Started:
+        return _Process([sys.executable, "-m", "i2rl.analysis.cli", *arguments], warm if cached else cold)
+
+    return start
+
+
+def _cache(folder: Path) -> dict[str, Any]:
+    return {
+        "jax_compilation_cache_dir": str(folder),
+        "jax_persistent_cache_min_compile_time_secs": 0,
+        "jax_persistent_cache_min_entry_size_bytes": -1,
+    }
+
+
+class Forks:
+    """Processes forked from one that has imported everything, and has computed nothing."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        self._server = subprocess.Popen(
+            [sys.executable, "-m", __name__, "--serve", str(folder)],
+            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            env={k: v for k, v in os.environ.items() if not k.startswith("JAX_")},
+        )  # fmt: skip
+
+    def start(self, arguments: Sequence[str], cached: bool) -> Started:
+        """As :data:`Start` says; one at a time."""
+        pipe = self._folder / "pipe"
+        pipe.unlink(missing_ok=True)
+        os.mkfifo(pipe)
+        assert self._server.stdin is not None
+        pid = int(self._asked(json.dumps([list(arguments), cached])))
+        return _Fork(os.open(pipe, os.O_RDONLY), pid, self._folder / "said", lambda: self._asked(""))
+
+    def _asked(self, line: str) -> str:
+        assert self._server.stdin is not None
+        assert self._server.stdout is not None
+        self._server.stdin.write(line + "\n")
+        self._server.stdin.flush()
+        return self._server.stdout.readline()
+
+    def __enter__(self) -> Forks:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        self._server.communicate()
+
+
+class _Fork(NamedTuple):
+    output: int
+    pid: int
+    said: Path
+    status: Callable[[], str]
+
+    def kill(self) -> None:
+        os.kill(self.pid, signal.SIGKILL)
+
+    def wait(self) -> tuple[int, str]:
+        os.close(self.output)
+        return int(self.status()), self.said.read_text()
+
+
+def _serve(folder: Path) -> None:
+    """Fork a learner for each request on standard input: print its process, and when it ends its status."""
+    import i2rl.analysis.stream
+    import i2rl.inference.lme
+    import i2rl.models.storage  # noqa: F401
+
+    while request := sys.stdin.readline():
+        arguments, cached = json.loads(request)
+        if pid := os.fork():
+            print(pid, flush=True)
+            sys.stdin.readline()  # until nobody kills it any more: its number is its own until it is reaped
+            print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
+            continue
+        _become(folder, arguments, cached)
+
+
+def _become(folder: Path, arguments: Sequence[str], cached: bool) -> None:
+    """Be the command from here on."""
+    import jax
+
+    from ..cli import main as command
+
+    os.dup2(os.open(folder / "said", os.O_WRONLY | os.O_CREAT | os.O_TRUNC), 2)
+    os.dup2(os.open(os.devnull, os.O_RDONLY), 0)
+    os.dup2(os.open(folder / "pipe", os.O_WRONLY), 1)
+    for name, value in _cache(folder / "compiled").items() if cached else ():
+        jax.config.update(name, value)
+    sys.argv = ["i2rl", *arguments]
+    status = 1
     try:
-        return Content(sessions, connection.execute("SELECT session, tree FROM state").fetchall())
+        command()
+    except SystemExit as end:
+        status = end.code if isinstance(end.code, int) else int(end.code is not None)
     finally:
-        connection.close()
+        sys.stdout.flush()
+        os._exit(status)
 
 
-def run_until(command: Sequence[str], environment: Mapping[str, str], instant: Instant) -> Ended:
-    """Start the command, which prints a line a session, and kill it at an instant unless it ends before.
+def run_until(learner: Started, instant: Instant, began: float) -> Ended:
+    """Let a learner run, and kill it at an instant unless it ends before.
 
     Raises ``RuntimeError`` with what it said if it fails by itself.
     """
-    began = time.monotonic()
-    with tempfile.TemporaryFile() as said:
-        child = subprocess.Popen(command, env=dict(environment), stdout=subprocess.PIPE, stderr=said)
-        assert child.stdout is not None
-        output = child.stdout.fileno()
-        reports, first, last, talking = 0, np.nan, np.nan, True
+    reports, first, last, talking = 0, np.nan, np.nan, True
 
-        def read_for(seconds: float) -> None:
-            nonlocal reports, first, last, talking
-            if not select.select([output], [], [], min(max(seconds, 0.0), 60.0))[0]:
-                return
-            chunk = os.read(output, 1 << 16)
-            talking = bool(chunk)
-            if lines := chunk.count(b"\n"):
-                last = time.monotonic() - began
-                first = last if reports == 0 else first
-                reports += lines
+    def read_for(seconds: float) -> None:
+        nonlocal reports, first, last, talking
+        if not select.select([learner.output], [], [], min(max(seconds, 0.0), 60.0))[0]:
+            return
+        chunk = os.read(learner.output, 1 << 16)
+        talking = bool(chunk)
+        if lines := chunk.count(b"\n"):
+            last = time.monotonic() - began
+            first = last if reports == 0 else first
+            reports += lines
 
-        while (
-            talking and reports < instant.reports and (left := began + instant.seconds - time.monotonic()) > 0
-        ):
-            read_for(left)
-        if reports >= instant.reports:
-            time.sleep(instant.delay)
-        if instant != NEVER:
-            child.kill()
-        while talking:
-            read_for(60.0)
-        status = child.wait()
-        seconds = time.monotonic() - began
-        if status not in (0, -9):
-            said.seek(0)
-            raise RuntimeError(f"it failed with status {status}: {said.read().decode()[-2000:]}")
+    while talking and reports < instant.reports and (left := began + instant.seconds - time.monotonic()) > 0:
+        read_for(left)
+    if reports >= instant.reports:
+        time.sleep(instant.delay)
+    if instant != NEVER:
+        learner.kill()
+    while talking:
+        read_for(60.0)
+    status, said = learner.wait()
+    seconds = time.monotonic() - began
+    if status not in (0, -9):
+        raise RuntimeError(f"it failed with status {status}: {said[-2000:]}")
     return Ended(status == -9, reports, first, last, seconds)
+
+
+# -- lives ------------------------------------------------------------------------------------------------
 
 
 def survive(
@@ -179,38 +326,48 @@ def survive(
     *,
     seed: int = 0,
     shares: Mapping[str, int] = SHARES,
+    forked: bool = False,
 ) -> Survival:
     """Run ``i2rl learn ARGUMENTS --journal ...`` under so many kills, and compare with learning in peace.
 
-    ``folder`` takes journals and compiled code; every ``sum(shares)`` kills go to a life of their own.
+    ``folder`` takes journals and compiled code; every ``sum(shares)`` kills go to a life of their own. With
+    ``forked`` the processes are :class:`Forks`.
     """
+    with ExitStack() as stack:
+        start = stack.enter_context(Forks(folder)).start if forked else processes(folder / "compiled")
+        return _survive(start, arguments, folder, kills, np.random.default_rng(seed), shares)
+
+
+def _survive(
+    start: Start,
+    arguments: Sequence[str],
+    folder: Path,
+    kills: int,
+    rng: np.random.Generator,
+    shares: Mapping[str, int],
+) -> Survival:
     began = time.monotonic()
-    rng = np.random.default_rng(seed)
-    cold = {k: v for k, v in os.environ.items() if not k.startswith("JAX_")}
-    warm = cold | {
-        "JAX_COMPILATION_CACHE_DIR": str(folder / "compiled"),
-        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
-        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
-    }
 
-    def command(journal: Path) -> list[str]:
-        tail = ["--journal", str(journal), "--json"]
-        return [sys.executable, "-m", "i2rl.analysis.cli", "learn", *arguments, *tail]
+    def run(journal: Path, instant: Instant = NEVER, cached: bool = True) -> Ended:
+        before = time.monotonic()
+        learner = start(["learn", *arguments, "--journal", str(journal), "--json"], cached)
+        return run_until(learner, instant, before)
 
-    # In peace, compiling everything; once more to fill the cache, and again to time a start that uses it.
-    compiled = run_until(command(folder / "peace.db"), cold, NEVER)
+    # In peace, compiling everything for the cache; again to time a start that uses it, and one without it.
+    first = run(folder / "peace.db")
     peace = content(folder / "peace.db")
     total = len(peace.sessions)
-    if compiled.reports != total or not total:
-        raise RuntimeError(f"{compiled.reports} sessions were reported, but {total} are in the journal")
+    if first.reports != total or not total:
+        raise RuntimeError(f"{first.reports} sessions were reported, but {total} are in the journal")
     problems = []
-    for name in ("filling.db", "cached.db"):
-        cached = run_until(command(folder / name), warm, NEVER)
+    cached = run(folder / "cached.db")
+    compiled = run(folder / "compiled.db", cached=False) if shares.get("compiling") else cached
+    for name in ("cached.db", *(["compiled.db"] if shares.get("compiling") else [])):
         if content(folder / name) != peace:
             problems.append(f"without kills, {name} differs from the first run")
     session = (cached.last - cached.first) / max(total - 1, 1)
     closing = cached.seconds - cached.last
-    idle = run_until(command(folder / "cached.db"), warm, NEVER).seconds
+    idle = run(folder / "cached.db").seconds
 
     def instant(phase: str, left: int, kills_ahead: int) -> Instant:
         if phase == "starting":
@@ -229,20 +386,22 @@ def survive(
     while len(done) < kills:
         life += 1
         journal = folder / f"life-{life}.db"
-        plan = list(rng.permutation([p for p in shares if p != "closing" for _ in range(shares[p])]))
+        plan = [
+            str(p) for p in rng.permutation([p for p in shares if p != "closing" for _ in range(shares[p])])
+        ]
         plan += ["closing"] * shares["closing"]
         plan, committed = plan[: kills - len(done)], 0
         for i, phase in enumerate(plan):
             for _ in range(ATTEMPTS):
                 when = instant(phase, total - committed, plan[i:].count("sessions"))
-                ended = run_until(command(journal), cold if phase == "compiling" else warm, when)
+                ended = run(journal, when, cached=phase != "compiling")
                 found = _copied(journal, folder)
                 before, committed = committed, len(found.sessions)
                 if ended.killed:
                     problem = _problem(found, peace, before, ended.reports)
                     done.append(Kill(phase, life, ended.seconds, before, ended.reports, committed, problem))
                     break
-        run_until(command(journal), warm, NEVER)
+        run(journal)
         if content(journal) != peace:
             problems.append(f"life {life} ended with another journal than learning in peace")
     problems += [f"kill {i + 1} ({k.phase}): {k.problem}" for i, k in enumerate(done) if k.problem]
@@ -311,7 +470,12 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=100)
     parser.add_argument("--sessions", type=int, default=400, help="lines of the stream, a session each")
     parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--forked", action="store_true", help="fork learners: half of the time a kill")
+    parser.add_argument("--serve", type=Path, help=argparse.SUPPRESS)
     options = parser.parse_args()
+    if options.serve is not None:
+        _serve(options.serve)
+        return
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         stream = folder / "stream.jsonl"
@@ -320,7 +484,7 @@ def main() -> None:
         with stream.open("w") as file:
             subprocess.run(simulate, stdout=file, check=True)
         arguments = ["--mdp", "patrol2", "--agent", "0", "--demos", str(stream)]
-        survival = survive(arguments, folder, options.kills, seed=options.seed)
+        survival = survive(arguments, folder, options.kills, seed=options.seed, forked=options.forked)
     kills, sessions = survival.kills, survival.sessions
     columns = ("meant for", "kills", "no new session", "mid-stream", "all learned", "unreported", "sessions")
     print_table(f"{len(kills)} kills of a learner of {sessions} sessions", columns, _table(kills, sessions))
