@@ -19,7 +19,7 @@ from scipy import optimize
 
 from ..models.chain import smooth
 from ..models.demonstration import Demonstration
-from ..models.evidence import Imperfection, _log, require_possible
+from ..models.evidence import Imperfection, _log, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
 from ..models.mixture import (
     Perceived,
@@ -213,6 +213,7 @@ def pose(
     for name, number, least in (*((n, x, 1) for n, x in at_least_one.items()), ("warmup", warmup, 0)):
         if number < least:
             raise ValueError(f"{name} must be at least {least}, got {number}")
+    sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
     present = np.flatnonzero(demonstration.lengths)
     if not len(present):
         raise ValueError("the demonstration has no trajectories; without data the posterior is the prior")

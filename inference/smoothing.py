@@ -14,6 +14,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
+from ..models.arguments import as_key
 from ..models.chain import Smoothed, filter_forward, sample_backward, smooth
 from ..models.demonstration import PAD, Demonstration
 from ..models.evidence import Imperfection, log_evidence
@@ -55,7 +56,10 @@ class Expectations(NamedTuple):
 
 
 def evidence_of(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> Evidence:
-    """Evaluate a sensor on a demonstration once, for all passes over it."""
+    """Evaluate a sensor on a demonstration once, for all passes over it.
+
+    Raises as :func:`~i2rl.models.evidence.log_evidence` does.
+    """
     return Evidence(log_evidence(sensor, mdp, demonstration), jnp.asarray(demonstration.kind) != PAD)
 
 
@@ -104,7 +108,7 @@ def sample_completions(
         keys = jax.random.split(key, draws)
         return jax.vmap(lambda k: sample_backward(k, mdp, factors, filtered, live))(keys)
 
-    keys = jax.random.split(key, evidence.live.shape[0])
+    keys = jax.random.split(as_key(key), evidence.live.shape[0])
     return jax.vmap(one, out_axes=1)(keys, *evidence)
 
 
@@ -217,7 +221,7 @@ def gibbs_completions(
         pairs: tuple[Array, Array] = lax.scan(kept, site.start(start_key), every)[1]
         return pairs[0][burn_in:], pairs[1][burn_in:]
 
-    keys = jax.random.split(key, evidence.live.shape[0])
+    keys = jax.random.split(as_key(key), evidence.live.shape[0])
     return jax.vmap(chain, out_axes=1)(keys, *evidence)
 
 
@@ -253,7 +257,7 @@ def settled_completions(
     algorithm as printed compares an average with itself; here it is compared with the one before.
     """
     n, length = evidence.live.shape
-    keys = jax.vmap(jax.random.split)(jax.random.split(key, n))
+    keys = jax.vmap(jax.random.split)(jax.random.split(as_key(key), n))
     sweeps = jax.vmap(lambda k: jax.random.split(k, draws + burn_in))(keys[:, 1])
     steps = jnp.maximum(jnp.sum(evidence.live), 1)
 

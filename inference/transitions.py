@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ..models.chain import _bounded_exp, _weigh, filter_forward
-from ..models.demonstration import SEEN, UNKNOWN, Demonstration
+from ..models.demonstration import SEEN, Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import occupancy
 from .smoothing import Evidence, gibbs_completions, log_likelihoods, settled_completions
@@ -167,7 +167,8 @@ def reported_transitions(
     """
     kind, state, action = (jnp.asarray(x) for x in demonstration[:3])
     s, a = jnp.maximum(state, 0), jnp.maximum(action, 0)
-    seen = (kind == SEEN) & (state != UNKNOWN) & (action != UNKNOWN) & mdp.available[s, a]
+    in_range = (state >= 0) & (state < mdp.n_states) & (action >= 0) & (action < mdp.n_actions)
+    seen = (kind == SEEN) & in_range & mdp.available[s, a]
     following = _landed(successors, s, a) & jnp.pad(seen, ((0, 0), (0, 1)))[:, 1:, None]
     known = jnp.any(following, -1, keepdims=True)
     # The list's own first entries are the dynamics' successors.

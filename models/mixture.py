@@ -19,9 +19,10 @@ from jaxtyping import Array, Bool, Float, Int
 from numpyro.distributions import constraints
 from numpyro.distributions.util import validate_sample
 
+from .arguments import as_key
 from .chain import filter_forward
 from .demonstration import PAD, SEEN, UNKNOWN
-from .evidence import Imperfection, _log, observe, require_fitting, step_log_evidence
+from .evidence import Imperfection, _log, checked_codes, fitting_sensor, observe, step_log_evidence
 from .mdp import TabularMDP
 from .occlusion import weights_prior
 from .planning import reward_of, simulate, soft_plan
@@ -77,7 +78,7 @@ def perceive(
     Both parts are padded to a multiple of eight, so that growing demonstrations meet few shapes. Not
     traceable.
     """
-    codes = np.asarray(codes)
+    sensor, codes = fitting_sensor(sensor, mdp), np.asarray(checked_codes(mdp, codes))
     distinct, row, repeats = np.unique(
         codes.reshape(len(codes), -1), axis=0, return_inverse=True, return_counts=True
     )
@@ -201,7 +202,7 @@ class MixtureLaw(dist.Distribution):
         *,
         validate_args: bool | None = None,
     ) -> None:
-        require_fitting(sensor, mdp)
+        sensor = fitting_sensor(sensor, mdp)
         if proportions.shape[-1:] != weights.shape[:1]:
             raise ValueError(
                 f"a mixture has a proportion for each row of weights, got shapes {proportions.shape} "
@@ -228,13 +229,13 @@ class MixtureLaw(dist.Distribution):
         shape = (*sample_shape, *self.batch_shape)
         chances = jnp.broadcast_to(jnp.log(self.proportions), (*shape, len(self.weights)))
         chances = chances.reshape(-1, len(self.weights))
-        codes = jax.vmap(one)(jax.random.split(key, len(chances)), chances)
+        codes = jax.vmap(one)(jax.random.split(as_key(key), len(chances)), chances)
         return codes.reshape((*shape, self.length, 3))
 
     @validate_sample
     def log_prob(self, value: Int[Array, "... L 3"]) -> Float[Array, "..."]:
         """Exact log-probability of what was perceived; ways and hidden steps summed out."""
-        value = jnp.asarray(value)
+        value = checked_codes(self.mdp, value)
         if value.shape[-2:] != (self.length, 3):
             raise ValueError(f"a value has shape [..., {self.length}, 3], got {value.shape}")
         perceived = as_evidence(self.mdp, self.sensor, value.reshape((-1, self.length, 3)))
