@@ -24,7 +24,7 @@ from numpyro.infer import NUTS
 from numpyro.infer.util import potential_energy
 
 from ..models.arguments import as_key
-from ..models.chain import filter_forward, sample_backward
+from ..models.chain import filter_all, sample_backward
 from ..models.demonstration import PAD, UNKNOWN, Demonstration
 from ..models.evidence import Imperfection, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
@@ -122,7 +122,7 @@ def complete(
     def one(inputs: tuple) -> Completions:
         key, theta = inputs
         factors = log_evidence + soft_plan(mdp, reward_of(mdp, theta)).log_policy
-        filtered = jax.vmap(filter_forward, in_axes=(None, 0, 0))(mdp, factors, live)
+        filtered = filter_all(mdp, factors, live)
 
         def sample(key: Array, row: Int[Array, ""]) -> tuple:
             passed = jax.tree.map(lambda x: x[row], filtered)

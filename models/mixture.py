@@ -20,7 +20,7 @@ from numpyro.distributions import constraints
 from numpyro.distributions.util import validate_sample
 
 from .arguments import as_key
-from .chain import filter_forward
+from .chain import filter_all
 from .demonstration import PAD, SEEN, UNKNOWN
 from .evidence import Imperfection, _log, checked_codes, fitting_sensor, observe, step_log_evidence
 from .mdp import TabularMDP
@@ -103,7 +103,7 @@ def perceive(
     return (
         Perceived(
             jnp.asarray(counts),
-            _dynamics(mdp, indifferent, seen.log_evidence, seen.live),
+            _dynamics(mdp, indifferent + seen.log_evidence, seen.live),
             others.log_evidence,
             others.live,
             jnp.asarray(np.concatenate(numbers)),
@@ -113,16 +113,9 @@ def perceive(
 
 
 def _passes(
-    mdp: TabularMDP,
-    log_policy: Float[Array, "S A"],
-    log_evidence: Float[Array, "h L S A"],
-    live: Bool[Array, "h L"],
+    mdp: TabularMDP, factors: Float[Array, "h L S A"], live: Bool[Array, "h L"]
 ) -> Float[Array, " h"]:
-    if not len(live):
-        return jnp.zeros(0)
-    return jax.vmap(lambda e, alive: filter_forward(mdp, e + log_policy, alive).log_likelihood)(
-        log_evidence, live
-    )
+    return filter_all(mdp, factors, live).log_likelihood if len(live) else jnp.zeros(0)
 
 
 _dynamics = jax.jit(_passes)
@@ -132,10 +125,7 @@ def trajectory_log_likelihoods(
     mdp: TabularMDP, log_policy: Float[Array, "S A"], perceived: Perceived
 ) -> Float[Array, " u"]:
     """Log-likelihood of each trajectory under one policy, hidden steps summed out."""
-    # An unavailable action has log-probability -inf, which zero visits must not turn into NaN.
-    finite = jnp.where(mdp.available, log_policy, 0.0)
-    seen = jnp.einsum("msa,sa->m", perceived.counts, finite) + perceived.dynamics
-    return jnp.concatenate([seen, _passes(mdp, log_policy, perceived.log_evidence, perceived.live)])
+    return component_log_likelihoods(mdp, log_policy[None], perceived)[0]
 
 
 def soft_policies(mdp: TabularMDP, weights: Float[Array, "T K"]) -> Float[Array, "T S A"]:
@@ -147,7 +137,14 @@ def component_log_likelihoods(
     mdp: TabularMDP, log_policies: Float[Array, "T S A"], perceived: Perceived
 ) -> Float[Array, "T u"]:
     """Log-likelihood of each trajectory under each policy."""
-    return jax.vmap(lambda policy: trajectory_log_likelihoods(mdp, policy, perceived))(log_policies)
+    # An unavailable action has log-probability -inf, which zero visits must not turn into NaN.
+    finite = jnp.where(mdp.available, log_policies, 0.0)
+    seen = jnp.einsum("msa,tsa->tm", perceived.counts, finite) + perceived.dynamics
+    # All passes of all policies at once: mapped over policies, each would be made in logarithms too.
+    factors = perceived.log_evidence + log_policies[:, None, None]
+    live = jnp.tile(perceived.live, (len(factors), 1))
+    passed = _passes(mdp, factors.reshape(-1, *factors.shape[2:]), live)
+    return jnp.concatenate([seen, passed.reshape(seen.shape[0], -1)], axis=1)
 
 
 def stick_proportions(sticks: Float[Array, " T-1"]) -> Float[Array, " T"]:

@@ -11,7 +11,7 @@ from numpyro.distributions import constraints
 from numpyro.distributions.util import validate_sample
 
 from .arguments import as_key
-from .chain import filter_forward
+from .chain import filter_all
 from .demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration
 from .evidence import Imperfection, checked_codes, fitting_sensor, observe, step_log_evidence
 from .mdp import TabularMDP
@@ -108,20 +108,17 @@ class TrajectoryLaw(dist.Distribution):
     def log_prob(self, value: Int[Array, "... L 3"]) -> Float[Array, "..."]:
         """Exact log-probability of what was perceived, hidden steps summed out."""
 
-        def one(codes: Int[Array, "L 3"]) -> Float[Array, ""]:
-            kind, state, action = codes[:, 0], codes[:, 1], codes[:, 2]
-            evidence = jax.vmap(
-                lambda k, s, a: step_log_evidence(
-                    self.sensor, self.mdp.n_states, self.mdp.n_actions, k, s, a, jnp.array(jnp.nan)
-                )
-            )(kind, state, action)
-            return filter_forward(self.mdp, evidence + self.log_policy, kind != PAD).log_likelihood
+        def evidence(code: Int[Array, " 3"]) -> Float[Array, "S A"]:
+            shape = (self.mdp.n_states, self.mdp.n_actions)
+            return step_log_evidence(self.sensor, *shape, code[0], code[1], code[2], jnp.array(jnp.nan))
 
         value = checked_codes(self.mdp, value)
         if value.shape[-2:] != (self.length, 3):
             raise ValueError(f"a value has shape [..., {self.length}, 3], got {value.shape}")
         flat = value.reshape((-1, self.length, 3))
-        return jax.vmap(one)(flat).reshape(value.shape[:-2])
+        factors = jax.vmap(jax.vmap(evidence))(flat) + self.log_policy
+        passed = filter_all(self.mdp, factors, flat[..., 0] != PAD)
+        return passed.log_likelihood.reshape(value.shape[:-2])
 
 
 def sample_demonstration(key: Array, law: TrajectoryLaw, n_trajectories: int) -> Demonstration:
