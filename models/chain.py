@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple, TypeVar
 
 import jax
@@ -128,27 +129,29 @@ def sample_backward(
 
 
 def _exactly(
-    plain: Callable[..., tuple[Passed, Bool[Array, ""]]],
+    complete: Callable[..., Passed],
     in_logs: Callable[..., Passed],
     mdp: TabularMDP,
     factors: Float[Array, "n L S A"],
     live: Bool[Array, "n L"],
 ) -> Passed:
     """Passes in plain numbers, and in logarithms those of trajectories that lost something by it."""
-    passed, lost = jax.vmap(plain, (None, 0, 0))(mdp, factors, live)
+    every = partial(jax.vmap, in_axes=(None, 0, 0))
+    forward = every(_forward)(mdp, factors, live)
 
     # Nothing but its arguments is kept for a derivative of what is hardly ever computed.
-    @jax.checkpoint
-    def again(mdp: TabularMDP, factors: Array, live: Array) -> Passed:
-        return jax.vmap(in_logs, (None, 0, 0))(mdp, factors, live)
+    again = jax.checkpoint(every(in_logs))
+
+    def plain() -> Passed:
+        return jax.vmap(complete, (None, 0, 0, 0))(mdp, factors, live, forward)
 
     def repaired() -> Passed:
         def chosen(x: Array, y: Array) -> Array:
-            return jnp.where(lost.reshape(-1, *[1] * (x.ndim - 1)), x, y)
+            return jnp.where(forward.lost.reshape(-1, *[1] * (x.ndim - 1)), x, y)
 
-        return jax.tree.map(chosen, again(mdp, factors, live), passed)
+        return jax.tree.map(chosen, again(mdp, factors, live), plain())
 
-    return lax.cond(jnp.any(lost), repaired, lambda: passed)
+    return lax.cond(jnp.any(forward.lost), repaired, plain)
 
 
 # -- in plain numbers -----------------------------------------------------------------------------------
@@ -223,14 +226,11 @@ def _lost(
     return jnp.sum(short) > _DISAPPOINTED
 
 
-def _filtered(mdp: TabularMDP, factors: Array, live: Array) -> tuple[Filtered, Bool[Array, ""]]:
-    passed = _forward(mdp, factors, live)
-    return Filtered(passed.log_likelihood, _log(passed.predicted), passed.final), passed.lost
+def _filtered(mdp: TabularMDP, factors: Array, live: Array, passed: _Forward) -> Filtered:
+    return Filtered(passed.log_likelihood, _log(passed.predicted), passed.final)
 
 
-def _smoothed(mdp: TabularMDP, factors: Array, live: Array) -> tuple[Smoothed, Bool[Array, ""]]:
-    passed = _forward(mdp, factors, live)
-
+def _smoothed(mdp: TabularMDP, factors: Array, live: Array, passed: _Forward) -> Smoothed:
     def step(future: Float[Array, " S"], inputs: tuple) -> tuple:
         predicted, factor, alive = inputs
         joint, _, scale = _weigh(predicted, factor)
@@ -239,12 +239,10 @@ def _smoothed(mdp: TabularMDP, factors: Array, live: Array) -> tuple[Smoothed, B
         return jnp.where(alive, message, future), jnp.where(alive, _shares(joint * onward), 0.0)
 
     pairs = _back(mdp, step, passed.predicted, factors, live)
-    return Smoothed(passed.log_likelihood, pairs, passed.final), passed.lost
+    return Smoothed(passed.log_likelihood, pairs, passed.final)
 
 
-def _transitions(mdp: TabularMDP, factors: Array, live: Array) -> tuple[SmoothedTransitions, Bool[Array, ""]]:
-    passed = _forward(mdp, factors, live)
-
+def _transitions(mdp: TabularMDP, factors: Array, live: Array, passed: _Forward) -> SmoothedTransitions:
     def step(future: Float[Array, " S"], inputs: tuple) -> tuple:
         predicted, factor, alive = inputs
         joint, _, scale = _weigh(predicted, factor)
@@ -252,10 +250,8 @@ def _transitions(mdp: TabularMDP, factors: Array, live: Array) -> tuple[Smoothed
         message = _message(predicted, factor - scale, jnp.sum(onward, -1))
         return jnp.where(alive, message, future), jnp.where(alive, _shares(joint[..., None] * onward), 0.0)
 
-    return (
-        SmoothedTransitions(passed.log_likelihood, _back(mdp, step, passed.predicted, factors, live)),
-        passed.lost,
-    )
+    triples = _back(mdp, step, passed.predicted, factors, live)
+    return SmoothedTransitions(passed.log_likelihood, triples)
 
 
 def _back(mdp: TabularMDP, step: Callable, *inputs: Array) -> Array:
