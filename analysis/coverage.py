@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -25,7 +25,7 @@ from ..inference.lme import lme_i2rl
 from ..inference.maxent import solve_dual
 from ..inference.maxent_constraints import FeatureTarget
 from ..inference.session import fleet
-from ..models.chain import filter_forward, sample_backward, smooth
+from ..models.chain import filter_all, sample_backward, smooth_all
 from ..models.demonstration import Demonstration
 from ..models.evidence import Imperfection, observe, step_log_evidence
 from ..models.mdp import TabularMDP
@@ -39,6 +39,9 @@ from .bounds import (
     no_regret_sizes,
     observed_bound,
 )
+
+# Trajectories completed together.
+_BATCH = 32
 
 
 class Setting(NamedTuple):
@@ -149,27 +152,32 @@ def complete_features(
     powers = mdp.discount ** jnp.arange(length + 1)
     beyond = powers[-1] * jax.vmap(mdp.expect_next, in_axes=1, out_axes=2)(expert.to_go)
 
-    def one(inputs: tuple) -> tuple:
-        key, codes = inputs
-        evidence = jax.vmap(
-            lambda k, s, a: step_log_evidence(
-                sensor, mdp.n_states, mdp.n_actions, k, s, a, jnp.array(jnp.nan)
-            )
-        )(*codes.T)
-        factors, live = evidence + expert.log_policy, jnp.ones(length, bool)
-        pairs = smooth(mdp, factors, live).pairs
-        exact = jnp.einsum("l,lsa,sak->k", powers[:-1], pairs, mdp.features)
-        exact += jnp.einsum("sa,sak->k", pairs[-1], beyond)
-        filtered = filter_forward(mdp, factors, live)
-        states, actions = jax.vmap(lambda k: sample_backward(k, mdp, factors, filtered, live))(
-            jax.random.split(key, draws)
-        )
-        collected = jnp.einsum("l,dlk->dk", powers[:-1], mdp.features[states, actions])
-        return exact, (collected + beyond[states[:, -1], actions[:, -1]]).mean(axis=0)
+    def evidence(code: Int[Array, " 3"]) -> Float[Array, "S A"]:
+        shape = (mdp.n_states, mdp.n_actions)
+        return step_log_evidence(sensor, *shape, code[0], code[1], code[2], jnp.array(jnp.nan))
 
-    keys = jax.random.split(key, runs * size)
-    exact, sampled = lax.map(one, (keys, codes.reshape(-1, length, 3)), batch_size=32)
-    return Completed(exact.reshape(runs, size, -1), sampled.reshape(runs, size, -1))
+    def several(inputs: tuple) -> tuple:
+        keys, codes = inputs
+        factors = jax.vmap(jax.vmap(evidence))(codes) + expert.log_policy
+        live = jnp.ones(factors.shape[:2], bool)
+        pairs = smooth_all(mdp, factors, live).pairs
+        exact = jnp.einsum("l,nlsa,sak->nk", powers[:-1], pairs, mdp.features)
+        exact += jnp.einsum("nsa,sak->nk", pairs[:, -1], beyond)
+
+        def sample(key: Array, *passed: Any) -> Float[Array, " K"]:
+            draw = jax.vmap(lambda k: sample_backward(k, mdp, *passed))
+            states, actions = draw(jax.random.split(key, draws))
+            collected = jnp.einsum("l,dlk->dk", powers[:-1], mdp.features[states, actions])
+            return (collected + beyond[states[:, -1], actions[:, -1]]).mean(axis=0)
+
+        return exact, jax.vmap(sample)(keys, factors, filter_all(mdp, factors, live), live)
+
+    n = runs * size
+    # Whole batches; what is repeated to fill the last one is cut off again.
+    rows = jnp.arange(-(-n // _BATCH) * _BATCH).reshape(-1, _BATCH) % n
+    given = (jax.random.split(key, n)[rows], codes.reshape(-1, length, 3)[rows])
+    completed = lax.map(several, given)
+    return Completed(*(x.reshape(-1, x.shape[-1])[:n].reshape(runs, size, -1) for x in completed))
 
 
 # -- fits ---------------------------------------------------------------------------------------------

@@ -30,8 +30,9 @@ from ..inference.posterior import (
     gather,
     posterior_mode,
 )
+from ..models.arguments import as_key
 from ..models.demonstration import PAD, UNKNOWN, Demonstration
-from ..models.evidence import Imperfection, require_possible
+from ..models.evidence import Imperfection, checked_demonstration, require_possible
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted
 from .history import provenance
@@ -192,6 +193,7 @@ def posterior_by_session(
                                 ("trajectories", trajectories, 1)):  # fmt: skip
         if number < least:
             raise ValueError(f"{name} must be at least {least}, got {number}")
+    key, demonstration = as_key(key), checked_demonstration(mdp, demonstration)
     last = -(-demonstration.n_trajectories // trajectories)
     numbers = [int(number) for number in at]
     if not numbers or sorted(set(numbers)) != numbers or not 1 <= numbers[0] <= numbers[-1] <= last:

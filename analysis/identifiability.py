@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float
 from ..inference.posterior import gather, posterior_mode
 from ..inference.smoothing import evidence_of, smooth_all
 from ..models.demonstration import SEEN, Demonstration
-from ..models.evidence import Imperfection, require_possible
+from ..models.evidence import Imperfection, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted, reward_of, soft_plan
 from .information import observed_information, total_log_likelihoods
@@ -123,6 +123,7 @@ def identifiability_of(
         is not positive.
     """
     require_discounted(mdp)
+    sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
     if not demonstration.lengths.any():
         raise ValueError("the demonstration has no steps; without data nothing is determined")
     if not scale > 0:

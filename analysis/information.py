@@ -22,7 +22,7 @@ from jaxtyping import Array, Float
 
 from ..inference.smoothing import evidence_of, log_likelihoods
 from ..models.demonstration import Demonstration
-from ..models.evidence import Imperfection
+from ..models.evidence import Imperfection, checked_demonstration, fitting_sensor
 from ..models.mdp import TabularMDP
 from ..models.planning import features_to_go, reward_of, soft_plan
 from ..models.trajectory import TrajectoryLaw, sample_demonstration
@@ -68,6 +68,11 @@ _scores = jax.jit(jax.jacfwd(_log_likelihoods))
 _hessian = jax.jit(jax.jacfwd(jax.grad(_total)))
 
 
+def _given(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> tuple:
+    checked = checked_demonstration(mdp, demonstration)
+    return mdp, fitting_sensor(sensor, mdp), checked.bucketed()
+
+
 @jax.jit
 def _along(weights: Float[Array, "W K"], *given: Any) -> Float[Array, " W"]:
     return jax.lax.map(lambda theta: _total(theta, *given), weights)
@@ -77,14 +82,14 @@ def total_log_likelihoods(
     mdp: TabularMDP, sensor: Imperfection, weights: Float[Array, "W K"], demonstration: Demonstration
 ) -> Float[np.ndarray, " W"]:
     """Exact log-likelihood (nats) of the whole demonstration under each of several weights."""
-    return np.asarray(_along(jnp.asarray(weights, float), mdp, sensor, demonstration.bucketed()))
+    return np.asarray(_along(jnp.asarray(weights, float), *_given(mdp, sensor, demonstration)))
 
 
 def scores(
     mdp: TabularMDP, sensor: Imperfection, weights: Float[Array, " K"], demonstration: Demonstration
 ) -> Float[np.ndarray, "n K"]:
     """Gradient of each trajectory's exact log-likelihood, hidden steps summed out."""
-    gradients = _scores(jnp.asarray(weights, float), mdp, sensor, demonstration.bucketed())
+    gradients = _scores(jnp.asarray(weights, float), *_given(mdp, sensor, demonstration))
     return np.asarray(gradients)[: demonstration.n_trajectories]
 
 
@@ -96,7 +101,7 @@ def observed_information(
     Differentiates through the soft plan by the implicit function theorem, twice. Need not be positive away
     from a maximum of the likelihood.
     """
-    hessian = np.asarray(_hessian(jnp.asarray(weights, float), mdp, sensor, demonstration.bucketed()))
+    hessian = np.asarray(_hessian(jnp.asarray(weights, float), *_given(mdp, sensor, demonstration)))
     return -(hessian + hessian.T) / 2
 
 

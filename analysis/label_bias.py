@@ -263,7 +263,7 @@ def _stacked(mdps: Sequence[TabularMDP]) -> TabularMDP:
 
 def _bare(mdp: TabularMDP) -> TabularMDP:
     """Without what differs in kind from world to world and is not used here: one program serves them all."""
-    return replace(mdp, labels=Labels(), inflow_pairs=None, inflow_probabilities=None)
+    return replace(mdp.without_inflow(), labels=Labels())
 
 
 @partial(jax.jit, static_argnames=("steps", "n"))

@@ -15,7 +15,7 @@ from jaxtyping import Array, Bool, Float
 
 from ..inference.smoothing import evidence_of, log_likelihoods
 from ..models.demonstration import Demonstration
-from ..models.evidence import Imperfection
+from ..models.evidence import Imperfection, checked_demonstration, fitting_sensor
 from ..models.mdp import TabularMDP
 from ..models.planning import (
     deterministic_policy,
@@ -138,6 +138,7 @@ def demonstration_log_likelihoods(
     Errors as for :func:`greedy_policy`, and ``ValueError`` for a sensor made for another MDP.
     """
     # Padded to a power of two, so that demonstrations of many sizes share a compiled program.
+    sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
     padded = demonstration.bucketed()
     return _log_likelihoods(mdp, sensor, _checked(mdp, weights), padded)[: demonstration.n_trajectories]
 

@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int
 from scipy.optimize import linear_sum_assignment
 
 from ..models.demonstration import PAD, SEEN, UNKNOWN, Demonstration
+from ..models.evidence import checked_demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import (
     deterministic_policy,
@@ -65,7 +66,7 @@ def expected_value_difference(
     n = demonstration.n_trajectories
     of_behaviour = _codes("labels", labels, n, len(truth))
     of_way = _codes("assignments", assignments, n, len(found))
-    visits = _state_visits(mdp, demonstration)
+    visits = _state_visits(mdp, checked_demonstration(mdp, demonstration))
     real = demonstration.lengths > 0
     if not real.any():
         raise ValueError("the value difference of no trajectories is not defined")

@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..models.demonstration import LOST, PAD, SEEN, UNKNOWN, Demonstration
-from ..models.evidence import Imperfection, observe, require_fitting
+from ..models.evidence import Imperfection, fitting_sensor, observe
 from ..models.mdp import TabularMDP
 from ..models.planning import finite_occupancy, reward_of, simulate, soft_plan
 from .diagnostics import InferenceDataError, require_posterior
@@ -58,7 +58,7 @@ def predictive_visits(
         For a demonstration without trajectories, or a sensor that does not fit the MDP.
     """
     weights = require_posterior(idata, mdp, sensor)
-    require_fitting(sensor, mdp)
+    sensor = fitting_sensor(sensor, mdp)
     demonstration = _observed(idata) if demonstration is None else demonstration
     kind, state = np.asarray(demonstration.kind), np.asarray(demonstration.state)
     if not len(kind):

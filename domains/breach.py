@@ -19,7 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ..models.chain import filter_forward
+from ..models.chain import condition
 from ..models.demonstration import HIDDEN, LOST
 from ..models.evidence import Imperfection, step_log_evidence
 from ..models.mdp import TabularMDP
@@ -142,7 +142,7 @@ def watch(
     possible = jnp.any((belief[:, None] > 0) & (factors > -jnp.inf))
     belief = jnp.where(possible, belief, 1 / mdp.n_states)
     factors = jnp.where(possible, factors, evidence)
-    return filter_forward(mdp.with_initial(belief), factors[None], jnp.array([True])).final
+    return condition(mdp, belief, factors)
 
 
 def project(

@@ -36,8 +36,8 @@ from ..models.evidence import (
     Sensor,
     Visibility,
     checked_predicates,
+    fitting_sensor,
     observe,
-    require_fitting,
 )
 from ..models.mdp import TabularMDP
 from ..models.planning import finite_occupancy, simulate
@@ -364,7 +364,7 @@ def demonstrate_noisy(
     if view is not None:
         presence = view.presence if presence is None else presence * view.presence
     sensor = Sensor(presence, model)
-    require_fitting(sensor, mdp)
+    sensor = fitting_sensor(sensor, mdp)
     if scores == "product":
         if reliabilities is None:
             reliabilities = (

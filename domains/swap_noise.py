@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..models.arguments import concrete, is_traced, rebuilt_unchecked
 from ..models.evidence import Imperfection, ObservationModel, Sensor
 
 
@@ -16,6 +17,7 @@ class _SwapFields(NamedTuple):
     noise: Float[Array, " M"]
 
 
+@rebuilt_unchecked
 class SwapNoise(_SwapFields):
     """Confusions that happen independently of each other: the report is the truth with some swaps applied.
 
@@ -38,21 +40,18 @@ class SwapNoise(_SwapFields):
 
     def __new__(cls, swaps: np.ndarray | Array, noise: np.ndarray | Array) -> SwapNoise:
         """Check and convert; see the class."""
-        # Only what a user would write is checked: JAX rebuilds this tuple around its own placeholders.
-        if isinstance(swaps, np.ndarray | list | tuple):
-            swaps = jnp.asarray(_checked_swaps(np.asarray(swaps)))
-        if isinstance(noise, np.ndarray | list | tuple):
-            p = np.asarray(noise, dtype=float)
-            if p.shape != swaps.shape[:1]:
+        flat = jnp.asarray(swaps if is_traced(swaps) else _checked_swaps(np.asarray(swaps)))
+        p = concrete("noise", noise)
+        if p is not None:
+            if p.shape != flat.shape[:1]:
                 raise ValueError(
-                    f"{swaps.shape[0]} swaps need as many probabilities of noise, got shape {list(p.shape)}"
+                    f"{flat.shape[0]} swaps need as many probabilities of noise, got shape {list(p.shape)}"
                 )
             for m in np.flatnonzero(~((p >= 0) & (p <= 1))):
                 raise ValueError(
                     f"the noise of a swap is a probability in [0, 1]; that of swap {m} is {p[m]}"
                 )
-            noise = jnp.asarray(p)
-        return super().__new__(cls, swaps, noise)
+        return super().__new__(cls, flat, jnp.asarray(noise if p is None else p, float))
 
     def __mul__(self, other: Imperfection) -> Sensor:  # type: ignore[override]
         """Compose with another imperfection, such as a :class:`Visibility`."""
@@ -77,7 +76,7 @@ class SwapNoise(_SwapFields):
         table = jnp.zeros((size, size))
         for weight, report in zip(weights, self._reports(), strict=True):
             table = table.at[jnp.arange(size), report].add(weight)
-        return ObservationModel(jnp.log(table).reshape(*shape, *shape))
+        return ObservationModel._make((jnp.log(table).reshape(*shape, *shape),))
 
     def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
         """Which swaps turned each truth into its report (flat indices); none where no swaps do."""

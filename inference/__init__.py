@@ -6,6 +6,8 @@ Names are imported when they are first used: the solvers behind some of them tak
 import importlib
 from typing import Any
 
+from .. import precision  # noqa: F401
+
 _HOMES = {
     "adversarial_learner": (
         "AdversarialReport",

@@ -25,7 +25,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from ..models.demonstration import Demonstration, DemonstrationError
-from ..models.evidence import Imperfection, Sensor, require_fitting, require_possible
+from ..models.evidence import Imperfection, Sensor, checked_demonstration, fitting_sensor, require_possible
 from ..models.extras import required
 from ..models.mdp import TabularMDP
 from ..models.networks import DTYPE
@@ -127,7 +127,7 @@ def gibbs_airl_tabular(
         raise ValueError(f"a sampler needs at least one draw and no negative burn-in, got {draws}, {burn_in}")
     if not change >= 0:
         raise ValueError(f"change must not be negative, got {change}")
-    require_fitting(sensor, mdp)
+    sensor = fitting_sensor(sensor, mdp)
 
     def truth(
         key: Array, log_policy: Array, evidence: Any, seen: Demonstration, horizon: int, logits: Array
@@ -162,16 +162,16 @@ def robust_airl_with_learned_sensor(
     """
     if not trust > 0:
         raise ValueError(f"trust in the assumed probabilities must be positive, got {trust}")
+    view = None if view is None else fitting_sensor(view, mdp)
     if view is not None and view.reading is not None:
         raise ValueError("the view says what is hidden; how reports err is learned, not given")
     noise = np.asarray(assumed.noise)
     for m in np.flatnonzero(~((noise > 0) & (noise < 1))):
         raise ValueError(f"learning starts from probabilities in (0, 1); that of confusion {m} is {noise[m]}")
-    sensor = Sensor(None if view is None else view.presence, assumed.reading)
+    sensor = fitting_sensor(Sensor(None if view is None else view.presence, assumed.reading), mdp)
     known: Any = (assumed, view)
     settings = {"truth": "exact, sensor learned", "trust": trust, "sensor": _digest(known)}
     look = _Look(_exact(mdp), np.asarray(mdp.successors), sensor, assumed, trust)
-    require_fitting(sensor, mdp)
     return _learner("robust-AIRL, sensor learned", mdp, look, tabular_airl, _AIRL, options, settings)
 
 
@@ -223,7 +223,7 @@ def _in_expectation(
     defaults: TabularTraining,
     options: Mapping[str, Any],
 ) -> Learner:
-    require_fitting(sensor, mdp)
+    sensor = fitting_sensor(sensor, mdp)
     look = _Look(_exact(mdp), np.asarray(mdp.successors), sensor)
     settings = {"truth": "exact", "sensor": _digest(sensor)}
     return _learner(name, mdp, look, kind, defaults, options, settings)
@@ -363,15 +363,13 @@ def _learner(
         state: TabularAdversarialState, demonstration: Demonstration
     ) -> tuple[TabularAdversarialState, Any]:
         began = time.perf_counter()
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="a session")
         lengths = demonstration.lengths
-        if not lengths.any():
-            raise DemonstrationError("a session needs at least one trajectory with a step")
         if lengths.max() > how.horizon:
             raise DemonstrationError(
                 f"trajectory {int(lengths.argmax())} has {lengths.max()} steps, above the learner's horizon "
                 f"of {how.horizon}: cut it with Demonstration.fragments, or set horizon"
             )
-        _require_reports(mdp, demonstration)
         new, report = run(state, demonstration.bucketed())
         if not np.isfinite(report.demonstration_log_likelihood):
             require_possible(look.sensor or Sensor(), mdp, demonstration)
@@ -389,20 +387,6 @@ def _chosen(possible: Array, new: Array, old: Array) -> Array:
         data = jnp.where(possible, jax.random.key_data(new), jax.random.key_data(old))
         return jax.random.wrap_key_data(data, impl=jax.random.key_impl(new))
     return jnp.where(possible, new, old)
-
-
-def _require_reports(mdp: TabularMDP, demonstration: Demonstration) -> None:
-    """Raise :class:`DemonstrationError` for an index of no state or action, naming trajectory and step."""
-    for index, what, count in (
-        (demonstration.state, "state", mdp.n_states), (demonstration.action, "action", mdp.n_actions)
-    ):  # fmt: skip
-        wrong = np.argwhere((np.asarray(index) < -1) | (np.asarray(index) >= count))
-        if len(wrong):
-            i, t = wrong[0]
-            raise DemonstrationError(
-                f"trajectory {i}, step {t}: {what} {index[i, t]} is out of range; "
-                f"indices run from 0 to {count - 1}"
-            )
 
 
 def _checked_features(mdp: TabularMDP, features: ArrayLike | None) -> Float[Array, "S d"]:

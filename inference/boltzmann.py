@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Float
 
 from ..models.demonstration import HIDDEN, LOST, PAD, UNKNOWN, Demonstration, DemonstrationError
+from ..models.evidence import checked_demonstration
 from ..models.mdp import TabularMDP, _PairNames
 from ..models.planning import action_values, hard_plan, policy_values, reward_of
 
@@ -95,7 +96,7 @@ def visit_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.ndar
     part (these methods need to see every step), for an index that is no state or action, and for an action
     that is not available; and without a step in any trajectory.
     """
-    kind, state, action = (np.asarray(x) for x in demonstration[:3])
+    kind, state, action, _ = checked_demonstration(mdp, demonstration)
     live = kind != PAD
     if not live.any():
         raise DemonstrationError("the demonstration has no step; this method needs at least one trajectory")
@@ -107,14 +108,6 @@ def visit_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.ndar
         raise DemonstrationError(
             f"trajectory {i}, step {t} {why}; this method needs to see the state and action of every step"
         )
-    for what, index, size in (("state", state, mdp.n_states), ("action", action, mdp.n_actions)):
-        wrong = np.argwhere(seen & ((index < 0) | (index >= size)))
-        if len(wrong):
-            i, t = wrong[0]
-            raise DemonstrationError(
-                f"trajectory {i}, step {t}: {what} {index[i, t]} is out of range; "
-                f"indices run from 0 to {size - 1}"
-            )
     i, t = np.nonzero(seen)
     s, a = state[i, t], action[i, t]
     barred = np.flatnonzero(~np.asarray(mdp.available)[s, a])

@@ -33,7 +33,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..models.demonstration import PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
-from ..models.evidence import Sensor, require_possible
+from ..models.evidence import Sensor, checked_demonstration, require_possible
 from ..models.mdp import Labels, TabularMDP
 from ..models.planning import features_to_go, require_discounted, reward_of, soft_plan
 from .session import Learner, Report, as_key
@@ -79,7 +79,7 @@ def feature_margin(
     margin is the gradient of ``start.V - theta.phi_hat``, the dual of ME-I2RL's ``features`` program for
     this session's statistic.
     """
-    return _session_margin(mdp, weights, demonstration, values)
+    return _session_margin(mdp, weights, checked_demonstration(mdp, demonstration), values)
 
 
 @jax.jit
@@ -176,8 +176,7 @@ def darko_i2rl(
 
     def update(state: DarkoState, demonstration: Demonstration) -> tuple[DarkoState, Report]:
         began = time.perf_counter()
-        if not demonstration.lengths.any():
-            raise DemonstrationError("a session needs at least one trajectory with a step")
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="a session")
         new, report = session(state, demonstration.bucketed())
         if not np.isfinite(report.demonstration_log_likelihood):
             require_possible(Sensor(), mdp, demonstration)

@@ -21,6 +21,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ..models.arguments import as_key
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted
@@ -339,7 +340,9 @@ def dpm_birl(
         real = demonstration.lengths > 0
         places, table, *rest = (
             np.asarray(x)
-            for x in _sample(key, mdp, jnp.asarray(counts[real]), settings, sweeps, proposals, updates)
+            for x in _sample(
+                as_key(key), mdp, jnp.asarray(counts[real]), settings, sweeps, proposals, updates
+            )
         )
         labels = np.full((sweeps, len(real)), -1)
         labels[:, real] = [_by_appearance(row) for row in places]

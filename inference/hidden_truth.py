@@ -24,7 +24,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..models.networks import Policy
-from ..models.sensing import GaussianSensor, Recording, ShiftSensor, Truths
+from ..models.sensing import GaussianSensor, Recording, ShiftSensor, Truths, require_continuous
 from .adversarial_learner import AdversarialTraining, adversarial
 from .discriminator import Discriminator, ExpertTransitions, Transitions, airl_discriminator
 from .gaussian_truth import GaussianTruth, fitted_sensor
@@ -223,12 +223,10 @@ def _learner(
 
 
 def _carried(sensor: Any, environment: Any) -> Any:
-    """A sensor checked, as arrays of the shapes that a fitted one has too."""
+    """A sensor as arrays of the shapes that a fitted one has too."""
+    require_continuous(sensor)
     if isinstance(sensor, GaussianSensor):
-        checked = GaussianSensor(*(np.asarray(x, float) for x in sensor))
-        return checked.sized(environment.observation_size, environment.actions.size)
-    if isinstance(sensor, ShiftSensor) and not 0 <= float(sensor.probability) <= 1:
-        raise ValueError(f"the probability of a shift must be in [0, 1], got {sensor.probability}")
+        return sensor.sized(environment.observation_size, environment.actions.size)
     return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, sensor)
 
 

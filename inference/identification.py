@@ -21,7 +21,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from ..models.demonstration import SEEN, Demonstration, DemonstrationError
-from ..models.evidence import FeatureNoise, Imperfection, Sensor, require_fitting, require_possible
+from ..models.evidence import (
+    FeatureNoise,
+    Imperfection,
+    Sensor,
+    checked_demonstration,
+    fitting_sensor,
+    require_possible,
+)
 from ..models.mdp import TabularMDP
 from ..models.planning import deterministic_policy, hard_plan, reward_of, soft_plan
 from .observation_program import Identification, unidentified_predicates
@@ -131,7 +138,7 @@ def sensor_identifier(
     seen = Sensor() if view is None else Sensor() * view
     if seen.reading is not None:
         raise ValueError("the view says what is hidden; how reports err is fitted, not given")
-    require_fitting(seen, mdp)
+    seen = fitting_sensor(seen, mdp)
     mask = None if reportable is None else np.asarray(reportable, bool)
     classes = report_classes(psi, mask)
     perception = entropic_perception(classes, scores, "posterior", errors, 1.0)
@@ -144,7 +151,8 @@ def sensor_identifier(
             raise ValueError(f"weights have shape [K] = [{mdp.n_features}], got {list(w.shape)}")
         if not np.isfinite(w).all():
             raise ValueError(f"weights must be numbers, got {w}")
-        if not (np.asarray(demonstration.kind) == SEEN).any():
+        demonstration = checked_demonstration(mdp, demonstration)
+        if not (demonstration.kind == SEEN).any():
             raise DemonstrationError("nothing was reported: there is nothing to judge the sensor by")
         session = prepare(mdp, classes, demonstration.bucketed(), perception.scored)
         reward = reward_of(mdp, jnp.asarray(w))

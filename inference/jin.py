@@ -27,6 +27,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..models.demonstration import SEEN, UNKNOWN, Demonstration, DemonstrationError
+from ..models.evidence import checked_demonstration
 from ..models.mdp import Labels, TabularMDP
 from ..models.planning import deterministic_policy, hard_plan, occupancy, require_discounted, reward_of
 from .session import Learner, Report, as_key
@@ -144,6 +145,7 @@ def _learner(name: str, mdp: TabularMDP, learning_rate: float) -> Learner:
 
     def update(state: JinState, demonstration: Demonstration) -> tuple[JinState, Report]:
         began = time.perf_counter()
+        demonstration = checked_demonstration(mdp, demonstration)
         _require_available(mdp, demonstration)
         new, report = session(state, demonstration.bucketed())
         return new, report.in_plain_numbers(time.perf_counter() - began)
@@ -157,6 +159,7 @@ def _session(
 ) -> tuple[JinState, Report]:
     kind, states, actions = (jnp.asarray(x).reshape(-1) for x in demonstration[:3])
     full = (kind == SEEN) & (states != UNKNOWN) & (actions != UNKNOWN)
+    in_range = (states >= 0) & (states < mdp.n_states) & (actions >= 0) & (actions < mdp.n_actions)
 
     def look(carry: tuple, pair: tuple) -> tuple:
         s, a, usable = pair
@@ -171,7 +174,7 @@ def _session(
 
     begin = (state.weights, jnp.zeros((), int))
     (weights, mistakes), _ = lax.scan(look, begin, (states, actions, full))
-    possible = jnp.all(~full | mdp.available[states, actions])
+    possible = jnp.all(~full | (in_range & mdp.available[states, actions]))
     learned = JinState(weights, (), state.session + 1)
     report: dict[str, Any] = {
         "session": state.session + 1,
@@ -187,18 +190,10 @@ def _session(
 
 
 def _require_available(mdp: TabularMDP, demonstration: Demonstration) -> None:
-    kind, states, actions = (np.asarray(x) for x in demonstration[:3])
+    kind, states, actions, _ = demonstration
     full = (kind == SEEN) & (states != UNKNOWN) & (actions != UNKNOWN)
     if not full.any():
         raise DemonstrationError("a session needs at least one step seen in full, its state and its action")
-    for what, index, count in (("state", states, mdp.n_states), ("action", actions, mdp.n_actions)):
-        wrong = full & ((index < 0) | (index >= count))
-        if wrong.any():
-            i, t = np.argwhere(wrong)[0]
-            raise DemonstrationError(
-                f"trajectory {i}, step {t}: {what} {index[i, t]} is out of range; "
-                f"indices run from 0 to {count - 1}"
-            )
     missing = full & ~np.asarray(mdp.available)[np.where(full, states, 0), np.where(full, actions, 0)]
     if missing.any():
         i, t = np.argwhere(missing)[0]

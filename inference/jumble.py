@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..models.demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration
-from ..models.evidence import Imperfection, require_fitting
+from ..models.evidence import Imperfection, fitting_sensor
 from ..models.mdp import TabularMDP
 from .smoothing import Evidence, evidence_of, smooth_all
 
@@ -67,7 +67,7 @@ def is_seen_whole(sensor: Imperfection, demonstration: Demonstration) -> bool:
 
 def seen_whole(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> SeenWhole:
     """Gather the visits of fully seen trajectories; traceable."""
-    require_fitting(sensor, mdp)
+    sensor = fitting_sensor(sensor, mdp)
     kind, state, action, _ = (jnp.asarray(x) for x in demonstration)
     present = jnp.ones(mdp.n_states) if sensor.presence is None else sensor.presence
 

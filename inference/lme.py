@@ -19,10 +19,11 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ..models.arguments import as_key
 from ..models.chain import Smoothed
 from ..models.demonstration import SEEN as SEEN_STEP
 from ..models.demonstration import Demonstration, DemonstrationError
-from ..models.evidence import Imperfection, Sensor, require_possible
+from ..models.evidence import Imperfection, Sensor, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
 from ..models.planning import SoftPlan, require_discounted, reward_of, soft_plan
 from .maxent import Solution, WarmStart, exponentiated_gradient, fit_counts, solve_dual
@@ -171,6 +172,7 @@ def lme_i2rl(
         For discount 1, an unknown option, or a slack that is negative or no number.
     """
     require_discounted(mdp)
+    sensor = fitting_sensor(sensor, mdp)
     method = _method(mdp, sensor, statistic, completion, slack, ridge, draws)
     configuration = {
         "statistic": statistic, "completion": completion, "solver": solver, "slack": described(slack),
@@ -187,6 +189,7 @@ def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: Imperfection, **option
 
     A control for what passing the weights on is worth. Options as for :func:`lme_i2rl`.
     """
+    sensor = fitting_sensor(sensor, mdp)
     carried = lme_i2rl(mdp, sensor, name="LME-I2RL with random weights", **options)
     configuration = carried.configuration
     method = _method(
@@ -449,8 +452,7 @@ def _learner(
 
     def update(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
         began = time.perf_counter()
-        if not demonstration.lengths.any():
-            raise DemonstrationError("a session needs at least one trajectory with a step")
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="a session")
         require_slack_in(method.slack, int(state.session) + 1)
         new, report = run(state, demonstration.bucketed())
         if not np.isfinite(report.demonstration_log_likelihood):
@@ -522,6 +524,7 @@ def batch_lme(
         raise ValueError(f"restarts and iterations must be at least 1, got {restarts} and {iterations}")
     if callable(slack):
         raise ValueError("batch learning has no sessions, so its slack must be a number, not a schedule")
+    sensor = fitting_sensor(sensor, mdp)
     method = _method(mdp, sensor, "counts", "exact", slack, ridge, 0)
 
     @jax.jit
@@ -556,8 +559,8 @@ def batch_lme(
         return lax.map(from_start, jax.random.split(key, restarts))
 
     def checked(key: Array, demonstration: Demonstration) -> BatchFit:
-        if not demonstration.lengths.any():
-            raise DemonstrationError("batch learning needs at least one trajectory with a step")
+        key = as_key(key)
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="batch learning")
         weights, average, objective, steps = (np.asarray(x) for x in fit(key, demonstration.bucketed()))
         if not np.isfinite(objective).any():
             require_possible(sensor, mdp, demonstration)

@@ -17,6 +17,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ..models.arguments import as_key
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted
@@ -145,7 +146,7 @@ def mlirl(
     require_discounted(mdp)
     require_positive(eta=eta, restarts=restarts, iterations=iterations)
     counts = visit_counts(mdp, demonstration).sum(0)
-    ends = _climb(key, mdp, jnp.asarray(counts), jnp.asarray(float(eta)), restarts, iterations)
+    ends = _climb(as_key(key), mdp, jnp.asarray(counts), jnp.asarray(float(eta)), restarts, iterations)
     best = int(np.argmax(ends.value))
     return MLIRLFit(
         np.asarray(ends.weights[best]),
@@ -294,7 +295,7 @@ def em_mlirl(
         # Rows of padding would count for the proportions.
         real = demonstration.lengths > 0
         mixtures, responsibilities, history = _em(
-            key, mdp, jnp.asarray(counts[real]), jnp.asarray(float(eta)),
+            as_key(key), mdp, jnp.asarray(counts[real]), jnp.asarray(float(eta)),
             clusters, restarts, iterations, ascents,
         )  # fmt: skip
         best = int(np.argmax(history[:, -1]))

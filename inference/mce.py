@@ -18,7 +18,6 @@ say): the policy is unique, the weights are one choice among those that give it.
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -178,8 +177,10 @@ def fit_weights(
     weights = (
         np.zeros(mdp.n_features) if start is None else _vector("start", start, mdp.n_features, "features")
     )
-    dual = partial(_evaluate, feature_dual, _without_inflow(mdp), target, horizon)
-    curvature = np.asarray(_feature_curvature(_without_inflow(mdp), weights, horizon))
+    # A single sweep scatters faster than it gathers (twice, at 1024 states), and processes of one size then
+    # share one compiled program. The Hessian, many sweeps side by side, keeps the gather: 6 times faster.
+    dual = partial(_evaluate, feature_dual, mdp.without_inflow(), target, horizon)
+    curvature = np.asarray(_feature_curvature(mdp.without_inflow(), weights, horizon))
     fit = _lbfgs(dual, curvature, weights, tolerance)
     if mdp.n_features <= NEWTON_LIMIT:
         fit = _newton(dual, lambda w: np.asarray(_feature_hessian(mdp, w, target, horizon)), fit, tolerance)
@@ -232,7 +233,7 @@ def fit_state_rewards(
             f"target visits must sum to {total:.6g} (the discounted steps of horizon {horizon}), "
             f"got {target.sum():.6g}"
         )
-    dual = partial(_evaluate, _state_dual, _without_inflow(mdp), target, horizon)
+    dual = partial(_evaluate, _state_dual, mdp.without_inflow(), target, horizon)
     fit = _lbfgs(dual, target, rewards, tolerance)
     _require_matched(
         fit, target, tolerance, lambda s: f"state {mdp.state_names[s]!r}",
@@ -242,12 +243,6 @@ def fit_state_rewards(
 
 
 # -- solvers ------------------------------------------------------------------------------------------
-
-
-def _without_inflow(mdp: TabularMDP) -> TabularMDP:
-    # A single sweep scatters faster than it gathers (twice, at 1024 states), and processes of one size then
-    # share one compiled program. The Hessian, many sweeps side by side, keeps the gather: 6 times faster.
-    return replace(mdp, inflow_pairs=None, inflow_probabilities=None)
 
 
 _Dual = Callable[[np.ndarray], tuple[float, np.ndarray]]

@@ -21,6 +21,7 @@ from jax import lax
 from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, Int
 
+from ..models.arguments import as_key
 from ..models.demonstration import Demonstration
 from ..models.evidence import Imperfection
 from ..models.mdp import TabularMDP
@@ -379,6 +380,7 @@ def gibbs_mixture_posterior(
     DemonstrationError, ValueError
         As :func:`sample_mixture_posterior`; also for ``auxiliary``, ``moves`` or ``thin`` below one.
     """
+    key = as_key(key)
     problem, demonstration, present = pose(
         mdp,
         sensor,

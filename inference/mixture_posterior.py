@@ -18,6 +18,7 @@ from jaxtyping import Array, Float
 from numpyro.distributions import constraints
 from numpyro.infer import NUTS
 
+from ..models.arguments import as_key
 from ..models.demonstration import Demonstration
 from ..models.evidence import Imperfection
 from ..models.mdp import TabularMDP
@@ -168,6 +169,7 @@ def sample_mixture_posterior(
         For an empty demonstration, a prior of another shape, a concentration that is not positive, numbers of
         components, draws or chains below one, or an undiscounted MDP.
     """
+    key = as_key(key)
     problem, demonstration, present = pose(
         mdp,
         sensor,

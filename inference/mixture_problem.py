@@ -17,9 +17,9 @@ from jaxtyping import Array, Float, Int
 from numpyro.infer.util import potential_energy
 from scipy import optimize
 
-from ..models.chain import smooth
+from ..models.chain import smooth_all
 from ..models.demonstration import Demonstration
-from ..models.evidence import Imperfection, _log, require_possible
+from ..models.evidence import Imperfection, _log, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
 from ..models.mixture import (
     Perceived,
@@ -140,10 +140,8 @@ def _mean_features(problem: MixtureProblem) -> Float[Array, "n K"]:
         indifferent = jnp.where(
             mdp.available, -jnp.log(jnp.sum(mdp.available, axis=1, keepdims=True)), -jnp.inf
         )
-        hidden = jax.vmap(lambda e, alive: smooth(mdp, e + indifferent, alive).pairs.sum(0))(
-            log_evidence, live
-        )
-        counts = jnp.concatenate([counts, hidden])
+        hidden = smooth_all(mdp, log_evidence + indifferent, live).pairs
+        counts = jnp.concatenate([counts, hidden.sum(1)])
     steps = jnp.maximum(jnp.sum(counts, axis=(1, 2)), 1.0)
     return (jnp.einsum("usa,sak->uk", counts, mdp.features) / steps[:, None])[problem.rows]
 
@@ -213,6 +211,7 @@ def pose(
     for name, number, least in (*((n, x, 1) for n, x in at_least_one.items()), ("warmup", warmup, 0)):
         if number < least:
             raise ValueError(f"{name} must be at least {least}, got {number}")
+    sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
     present = np.flatnonzero(demonstration.lengths)
     if not len(present):
         raise ValueError("the demonstration has no trajectories; without data the posterior is the prior")

@@ -18,8 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..models.arguments import as_key
 from ..models.demonstration import Demonstration, DemonstrationError
-from ..models.evidence import Imperfection, Sensor, require_possible
+from ..models.evidence import Imperfection, Sensor, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
 from ..models.planning import reachable_states, require_discounted
 from .clustering import Clustering
@@ -170,7 +171,7 @@ def mme_mtirl(
     ValueError
         For discount 1, fewer than one way, or settings that are negative or not finite.
     """
-    sensor = Sensor() if sensor is None else sensor
+    sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
     program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
     configuration = {
         "ways": ways, "strength": strength, "price": price, "l1": l1, "ridge": ridge, "restarts": restarts,
@@ -187,7 +188,8 @@ def mme_mtirl(
 
     def update(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
         began = time.perf_counter()
-        rows = _rows(demonstration)
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="multi-task learning")
+        rows = np.flatnonzero(demonstration.lengths)
         jumble = _gather(mdp, sensor, demonstration)
         new, report = _concluded(program, state, *_begin(program, state, jumble, restarts, _searched))
         if not np.isfinite(report.demonstration_log_likelihood):
@@ -243,19 +245,21 @@ def batch_mme_mtirl(
     is a warning, and at most one way a trajectory. ``fit`` raises :class:`DemonstrationError` as
     :func:`mme_mtirl` does.
     """
-    sensor = Sensor() if sensor is None else sensor
+    sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
     program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
     nothing, empty = nothing_kept(mdp, ways), empty_mixture(mdp, ways)
 
     def fit(key: Array, demonstration: Demonstration) -> Clustering:
-        rows = _rows(demonstration)
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="multi-task learning")
+        rows = np.flatnonzero(demonstration.lengths)
         if len(rows) < ways:
             warnings.warn(
                 f"{ways} ways were to be started from, but there are {len(rows)} trajectories: no more ways "
                 "than that can be found",
                 stacklevel=2,
             )
-        found = _searched(program, _gather(mdp, sensor, demonstration), nothing, empty, key, restarts).fit
+        jumble = _gather(mdp, sensor, demonstration)
+        found = _searched(program, jumble, nothing, empty, as_key(key), restarts).fit
         if not np.isfinite(found.objective):
             _explain_impossible(sensor, mdp, demonstration)
         proportions = np.asarray(found.mixture.proportions)
@@ -305,7 +309,9 @@ def assign_trajectories(
         raise ValueError(f"weights must be finite, got {weights[~np.isfinite(weights)][0]}")
     if not (np.isfinite(proportions) & (proportions >= 0)).all() or not proportions.any():
         raise ValueError(f"proportions must be finite, not negative and not all zero, got {proportions}")
-    sensor, rows = Sensor() if sensor is None else sensor, _rows(demonstration)
+    sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
+    demonstration = checked_demonstration(mdp, demonstration, needed_by="multi-task learning")
+    rows = np.flatnonzero(demonstration.lengths)
     jumble = _gather(mdp, sensor, demonstration)
     assigned = _assigned(mdp, jnp.asarray(weights), jnp.asarray(proportions), jumble)
     if not np.isfinite(assigned.log_likelihood).all():
@@ -362,14 +368,6 @@ def _gather(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration)
     # Visits of a few trajectories more cost less than compiling for one shape more.
     rows = max(padded.n_trajectories, _FEWEST_ROWS)
     return _seen_whole(mdp, seen_by, padded.padded(rows, padded.kind.shape[1]))
-
-
-def _rows(demonstration: Demonstration) -> Int[np.ndarray, " n"]:
-    """Rows that are trajectories rather than padding."""
-    rows = np.flatnonzero(demonstration.lengths)
-    if not len(rows):
-        raise DemonstrationError("multi-task learning needs at least one trajectory with a step")
-    return rows
 
 
 def _explain_impossible(sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration) -> None:

@@ -20,8 +20,9 @@ from jaxtyping import Array, Bool, Float, Int
 from numpyro.infer import NUTS
 from numpyro.infer.util import potential_energy
 
+from ..models.arguments import as_key
 from ..models.demonstration import Demonstration
-from ..models.evidence import FeatureNoise, Imperfection, Sensor, require_possible
+from ..models.evidence import FeatureNoise, Imperfection, Sensor, checked_demonstration, require_possible
 from ..models.mdp import TabularMDP
 from ..models.noisy_behaviour import noisy_behaviour_model, reliabilities_prior
 from ..models.planning import require_discounted
@@ -191,6 +192,7 @@ def noisy_problem(
 
     Raises as :func:`sample_noisy_posterior` does.
     """
+    demonstration = checked_demonstration(mdp, demonstration)
     if demonstration.n_trajectories == 0:
         raise ValueError("the demonstration has no trajectories; without data the posterior is the prior")
     require_discounted(mdp)
@@ -275,6 +277,7 @@ def sample_noisy_posterior(
     names = tuple(f"psi{j + 1}" for j in range(n_predicates)) if names is None else names
     if len(names) != n_predicates:
         raise ValueError(f"there is one name for each of {n_predicates} predicates, got {list(names)}")
+    key = as_key(key)
     start_key, chain_key = jax.random.split(key)
     starts = noisy_starts(start_key, problem, chains)
     run = partial(

@@ -25,7 +25,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 from scipy import ndimage, sparse
 
-from ..models.chain import filter_forward, sample_backward, smooth
+from ..models.chain import Filtered, filter_all, sample_backward, smooth_all
 from ..models.mdp import TabularMDP
 from ..models.sensing import FiniteSensor, Recording, ShiftSensor, Truths, truths
 
@@ -362,16 +362,14 @@ def _cell_posterior(
     partition: Partition, policy: Any, sensor: FiniteSensor, chain: Recording
 ) -> Float[Array, "n L S"]:
     factors, _ = _cell_factors(partition, policy, sensor, chain)
-    return jax.vmap(lambda e, live: smooth(partition.mdp, e, live).pairs.sum(-1))(factors, chain.live)
+    return smooth_all(partition.mdp, factors, chain.live).pairs.sum(-1)
 
 
 @partial(jax.jit, static_argnums=5)
 def _drawn_places(
     key: Array, partition: Partition, policy: Any, sensor: FiniteSensor, chain: Recording, draws: int
 ) -> Float[Array, "M n L d"]:
-    def one(key: Array, factor: Array, live: Array, behind: _Behind) -> Array:
-        filtered = filter_forward(partition.mdp, factor, live)
-
+    def one(key: Array, factor: Array, filtered: Filtered, live: Array, behind: _Behind) -> Array:
         def draw(key: Array) -> Array:
             key_cell, key_place = jax.random.split(key)
             drawn, _ = sample_backward(key_cell, partition.mdp, factor, filtered, live)
@@ -382,7 +380,9 @@ def _drawn_places(
         return jax.vmap(draw)(jax.random.split(key, draws))
 
     factors, behind = _cell_factors(partition, policy, sensor, chain)
-    return jax.vmap(one, out_axes=1)(jax.random.split(key, len(factors)), factors, chain.live, behind)
+    filtered = filter_all(partition.mdp, factors, chain.live)
+    keys = jax.random.split(key, len(factors))
+    return jax.vmap(one, out_axes=1)(keys, factors, filtered, chain.live, behind)
 
 
 def partition_truth(

@@ -17,6 +17,7 @@ import numpyro.distributions as dist
 from jax import lax
 from jaxtyping import Array, Bool, Float
 
+from ..models.arguments import as_key
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.occlusion import weights_prior
@@ -174,7 +175,7 @@ def birl(
     walk: Walk = jax.tree.map(
         np.asarray,
         _walk(
-            key, mdp, jnp.asarray(counts), prior, jnp.asarray(float(eta)), jnp.asarray(float(step)),
+            as_key(key), mdp, jnp.asarray(counts), prior, jnp.asarray(float(eta)), jnp.asarray(float(step)),
             chains, warmup, draws,
         ),
     )  # fmt: skip

@@ -23,9 +23,10 @@ from jaxtyping import Array, Bool, Float, Int
 from numpyro.infer import NUTS
 from numpyro.infer.util import potential_energy
 
-from ..models.chain import filter_forward, sample_backward
+from ..models.arguments import as_key
+from ..models.chain import filter_all, sample_backward
 from ..models.demonstration import PAD, UNKNOWN, Demonstration
-from ..models.evidence import Imperfection, require_possible
+from ..models.evidence import Imperfection, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
 from ..models.occlusion import occlusion_model, weights_prior
 from ..models.planning import require_discounted, reward_of, soft_plan
@@ -121,7 +122,7 @@ def complete(
     def one(inputs: tuple) -> Completions:
         key, theta = inputs
         factors = log_evidence + soft_plan(mdp, reward_of(mdp, theta)).log_policy
-        filtered = jax.vmap(filter_forward, in_axes=(None, 0, 0))(mdp, factors, live)
+        filtered = filter_all(mdp, factors, live)
 
         def sample(key: Array, row: Int[Array, ""]) -> tuple:
             passed = jax.tree.map(lambda x: x[row], filtered)
@@ -167,7 +168,8 @@ def gather(
     Most fragments of a little-seen expert are wholly hidden, hence identical. Rows are padded to a multiple
     of eight, so that growing demonstrations meet few shapes.
     """
-    codes = np.asarray(demonstration.codes)
+    sensor = fitting_sensor(sensor, mdp)
+    codes = np.asarray(checked_demonstration(mdp, demonstration).codes)
     distinct, rows, repeats = np.unique(
         codes.reshape(len(codes), -1), axis=0, return_inverse=True, return_counts=True
     )
@@ -239,6 +241,7 @@ def sample_posterior(
     for name, number, least in (("draws", draws, 1), ("chains", chains, 1), ("warmup", warmup, 0)):
         if number < least:
             raise ValueError(f"{name} must be at least {least}, got {number}")
+    key, demonstration = as_key(key), checked_demonstration(mdp, demonstration)
     if demonstration.n_trajectories == 0:
         raise ValueError("the demonstration has no trajectories; without data the posterior is the prior")
     require_discounted(mdp)

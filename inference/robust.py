@@ -23,7 +23,14 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
 from ..models.demonstration import SEEN, Demonstration, DemonstrationError
-from ..models.evidence import FeatureNoise, Imperfection, Sensor, require_fitting, require_possible
+from ..models.evidence import (
+    FeatureNoise,
+    Imperfection,
+    Sensor,
+    checked_demonstration,
+    fitting_sensor,
+    require_possible,
+)
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted
 from .lme import Batch, _change, _digest, _Method, _method, _newton, _random_weights, batch_lme
@@ -275,6 +282,7 @@ def robust_irl(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Batch:
     Batch latent maximum-entropy IRL under that sensor; options and errors as of
     :func:`~i2rl.inference.batch_lme`. Raises ``ValueError`` for a sensor without an observation model.
     """
+    sensor = fitting_sensor(sensor, mdp)
     if sensor.reading is None:
         raise ValueError("robust IRL needs a sensor with an observation model; this one reports exactly")
     return batch_lme(mdp, sensor, **options)._replace(name="Robust IRL")
@@ -290,7 +298,7 @@ def _checked_method(
     seen = Sensor() if view is None else Sensor() * view
     if seen.reading is not None:
         raise ValueError("the view says what is hidden; how reports err is learned, not given")
-    require_fitting(seen, mdp)
+    seen = fitting_sensor(seen, mdp)
     return _method(mdp, seen, statistic, "exact", slack, ridge, 0)
 
 
@@ -495,7 +503,9 @@ def _learner(
 
     def update(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOReport]:
         began = time.perf_counter()
-        seen = _checked_session(name, demonstration, scores_needed, configuration.get("truths") == "oracle")
+        seen = _checked_session(
+            mdp, name, demonstration, scores_needed, configuration.get("truths") == "oracle"
+        )
         if isinstance(demonstration, WithTruth):
             _require_truth(mdp, demonstration)
         require_slack_in(method.slack, int(state.session) + 1)
@@ -566,22 +576,18 @@ class _Solved(NamedTuple):
     iterations: Int[Array, ""]
 
 
-def _checked_session(name: str, demonstration: Any, scores_needed: bool, truth_needed: bool) -> Demonstration:
+def _checked_session(
+    mdp: TabularMDP, name: str, demonstration: Any, scores_needed: bool, truth_needed: bool
+) -> Demonstration:
     """What was seen, with the scores that are needed."""
     if truth_needed != isinstance(demonstration, WithTruth):
         given = type(demonstration).__name__
         raise TypeError(
             f"{name} takes {'WithTruth(seen, truth)' if truth_needed else 'a Demonstration'}, got {given}"
         )
-    seen: Demonstration = demonstration.seen if truth_needed else demonstration
-    if not seen.lengths.any():
-        raise DemonstrationError("a session needs at least one trajectory with a step")
-    score, reported = np.asarray(seen.score), np.asarray(seen.kind) == SEEN
-    outside = reported & ~np.isnan(score) & ~((score >= 0) & (score <= 1))
-    if outside.any():
-        i, t = np.argwhere(outside)[0]
-        raise DemonstrationError(f"trajectory {i}, step {t}: score must lie in [0, 1], got {score[i, t]}")
-    missing = reported & np.isnan(score)
+    given = demonstration.seen if truth_needed else demonstration
+    seen = checked_demonstration(mdp, given, needed_by="a session")
+    missing = (seen.kind == SEEN) & np.isnan(seen.score)
     if scores_needed and missing.any():
         i, t = np.argwhere(missing)[0]
         raise DemonstrationError(

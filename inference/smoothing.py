@@ -14,7 +14,9 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from ..models.chain import Smoothed, filter_forward, sample_backward, smooth
+from ..models import chain
+from ..models.arguments import as_key
+from ..models.chain import Filtered, Smoothed, filter_all, filter_forward, sample_backward
 from ..models.demonstration import PAD, Demonstration
 from ..models.evidence import Imperfection, log_evidence
 from ..models.mdp import TabularMDP
@@ -55,20 +57,23 @@ class Expectations(NamedTuple):
 
 
 def evidence_of(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> Evidence:
-    """Evaluate a sensor on a demonstration once, for all passes over it."""
+    """Evaluate a sensor on a demonstration once, for all passes over it.
+
+    Raises as :func:`~i2rl.models.evidence.log_evidence` does.
+    """
     return Evidence(log_evidence(sensor, mdp, demonstration), jnp.asarray(demonstration.kind) != PAD)
 
 
 def smooth_all(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Smoothed:
     """Forward-backward over every trajectory; fields as in :class:`Smoothed` with a leading ``n``."""
-    return jax.vmap(lambda e, live: smooth(mdp, e + log_policy, live))(*evidence)
+    return chain.smooth_all(mdp, evidence.log_evidence + log_policy, evidence.live)
 
 
 def log_likelihoods(
     mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence
 ) -> Float[Array, " n"]:
     """Exact log-likelihood of each trajectory."""
-    return jax.vmap(lambda e, live: filter_forward(mdp, e + log_policy, live).log_likelihood)(*evidence)
+    return filter_all(mdp, evidence.log_evidence + log_policy, evidence.live).log_likelihood
 
 
 def expectations(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Expectations:
@@ -98,14 +103,15 @@ def sample_completions(
 ) -> tuple[Int[Array, "draws n L"], Int[Array, "draws n L"]]:
     """Independent joint completions (states, actions) by backward sampling; -1 on padding."""
 
-    def one(key: Array, e: Array, live: Array) -> tuple:
-        factors = e + log_policy
-        filtered = filter_forward(mdp, factors, live)
+    factors = evidence.log_evidence + log_policy
+
+    def one(key: Array, factors: Array, filtered: Filtered, live: Array) -> tuple:
         keys = jax.random.split(key, draws)
         return jax.vmap(lambda k: sample_backward(k, mdp, factors, filtered, live))(keys)
 
-    keys = jax.random.split(key, evidence.live.shape[0])
-    return jax.vmap(one, out_axes=1)(keys, *evidence)
+    keys = jax.random.split(as_key(key), evidence.live.shape[0])
+    filtered = filter_all(mdp, factors, evidence.live)
+    return jax.vmap(one, out_axes=1)(keys, factors, filtered, evidence.live)
 
 
 def blocked_posterior(
@@ -217,7 +223,7 @@ def gibbs_completions(
         pairs: tuple[Array, Array] = lax.scan(kept, site.start(start_key), every)[1]
         return pairs[0][burn_in:], pairs[1][burn_in:]
 
-    keys = jax.random.split(key, evidence.live.shape[0])
+    keys = jax.random.split(as_key(key), evidence.live.shape[0])
     return jax.vmap(chain, out_axes=1)(keys, *evidence)
 
 
@@ -253,7 +259,7 @@ def settled_completions(
     algorithm as printed compares an average with itself; here it is compared with the one before.
     """
     n, length = evidence.live.shape
-    keys = jax.vmap(jax.random.split)(jax.random.split(key, n))
+    keys = jax.vmap(jax.random.split)(jax.random.split(as_key(key), n))
     sweeps = jax.vmap(lambda k: jax.random.split(k, draws + burn_in))(keys[:, 1])
     steps = jnp.maximum(jnp.sum(evidence.live), 1)
 

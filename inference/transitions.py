@@ -9,14 +9,13 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from ..models.chain import _bounded_exp, _weigh, filter_forward
-from ..models.demonstration import SEEN, UNKNOWN, Demonstration
+from ..models.chain import smooth_transitions_all
+from ..models.demonstration import SEEN, Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import occupancy
 from .smoothing import Evidence, gibbs_completions, log_likelihoods, settled_completions
@@ -69,38 +68,11 @@ def summarised(completed: Completed) -> TransitionStatistic:
 # -- three ways from reports to transitions -----------------------------------------------------------
 
 
-def smooth_transitions(
-    mdp: TabularMDP, factors: Float[Array, "L S A"], live: Bool[Array, " L"]
-) -> tuple[Float[Array, ""], Float[Array, "L S A B"]]:
-    """Log-likelihood of one trajectory, and ``P(s_t, a_t, s_{t+1} | all evidence)`` of each step.
-
-    ``factors`` are ``log pi + log e_t`` as in :mod:`i2rl.models.chain`. After the last step the successor is
-    distributed as the dynamics have it.
-    """
-    filtered = filter_forward(mdp, factors, live)
-
-    def step(future: Float[Array, " S"], inputs: tuple) -> tuple:
-        predicted, factor, alive = inputs
-        joint, _, scale = _weigh(predicted, factor)
-        onward = mdp.probabilities * future[mdp.successors]
-        triples = joint[..., None] * onward
-        total = jnp.sum(triples)
-        triples = triples / jnp.where(total > 0, total, 1.0)
-        reached = jnp.sum(_bounded_exp(factor - scale) * jnp.sum(onward, -1), axis=1)
-        message = jnp.where(predicted > 0, reached, 0.0)
-        message = message / jnp.maximum(jnp.max(message), 1e-300)
-        return jnp.where(alive, message, future), jnp.where(alive, triples, 0.0)
-
-    ones = jnp.ones(mdp.n_states)
-    triples: Array = lax.scan(step, ones, (filtered.predicted, factors, live), reverse=True)[1]
-    return filtered.log_likelihood, triples
-
-
 def exact_transitions(
     mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, horizon: int
 ) -> Completed:
     """The posterior of every transition given all reports, hidden steps and errors summed out."""
-    log_likelihood, steps = jax.vmap(lambda e, live: smooth_transitions(mdp, e + log_policy, live))(*evidence)
+    log_likelihood, steps = smooth_transitions_all(mdp, evidence.log_evidence + log_policy, evidence.live)
     return Completed(log_likelihood, steps, _starts(steps, evidence.live, horizon))
 
 
@@ -167,7 +139,8 @@ def reported_transitions(
     """
     kind, state, action = (jnp.asarray(x) for x in demonstration[:3])
     s, a = jnp.maximum(state, 0), jnp.maximum(action, 0)
-    seen = (kind == SEEN) & (state != UNKNOWN) & (action != UNKNOWN) & mdp.available[s, a]
+    in_range = (state >= 0) & (state < mdp.n_states) & (action >= 0) & (action < mdp.n_actions)
+    seen = (kind == SEEN) & in_range & mdp.available[s, a]
     following = _landed(successors, s, a) & jnp.pad(seen, ((0, 0), (0, 1)))[:, 1:, None]
     known = jnp.any(following, -1, keepdims=True)
     # The list's own first entries are the dynamics' successors.

@@ -4,10 +4,7 @@ Importing this package switches JAX to 64-bit floats: likelihoods of long trajec
 programs need the digits.
 """
 
-import jax
-
-jax.config.update("jax_enable_x64", True)
-
+from .. import precision  # noqa: F401  (before anything computes)
 from .archives import StorageError
 from .confusions import Confusions
 from .demonstration import (

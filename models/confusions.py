@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from .arguments import concrete, is_traced, rebuilt_unchecked
 from .evidence import Imperfection, ObservationModel, Sensor
 
 
@@ -16,6 +17,7 @@ class _ConfusionFields(NamedTuple):
     noise: Float[Array, " M"]
 
 
+@rebuilt_unchecked
 class Confusions(_ConfusionFields):
     """A pair is reported as another with the probability of the one confusion that acts on it.
 
@@ -39,17 +41,14 @@ class Confusions(_ConfusionFields):
 
     def __new__(cls, reports: np.ndarray | Array, noise: np.ndarray | Array) -> Confusions:
         """Check and convert; see the class."""
-        # Only what a user would write is checked: JAX rebuilds this tuple around its own placeholders.
-        if isinstance(reports, np.ndarray | list | tuple):
-            reports = jnp.asarray(_checked(np.asarray(reports)))
-        if isinstance(noise, np.ndarray | list | tuple):
-            p = np.asarray(noise, float)
-            if p.shape != reports.shape[:1]:
-                raise ValueError(f"{len(reports)} confusions need as many probabilities, got {list(p.shape)}")
+        flat = jnp.asarray(reports if is_traced(reports) else _checked(np.asarray(reports)))
+        p = concrete("noise", noise)
+        if p is not None:
+            if p.shape != flat.shape[:1]:
+                raise ValueError(f"{len(flat)} confusions need as many probabilities, got {list(p.shape)}")
             for m in np.flatnonzero(~((p >= 0) & (p <= 1))):
                 raise ValueError(f"a confusion has a probability in [0, 1]; that of confusion {m} is {p[m]}")
-            noise = jnp.asarray(p)
-        return super().__new__(cls, reports, noise)
+        return super().__new__(cls, flat, jnp.asarray(noise if p is None else p, float))
 
     @staticmethod
     def of_actions(
@@ -83,7 +82,7 @@ class Confusions(_ConfusionFields):
         g = jnp.arange(size)
         table = jnp.zeros((size, size)).at[g, g].add(1 - chance.sum(0))
         table = table.at[g, self.reports.reshape(-1, size)].add(chance)
-        return ObservationModel(jnp.log(table).reshape(*shape, *shape))
+        return ObservationModel._make((jnp.log(table).reshape(*shape, *shape),))
 
     def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
         """Which confusion turned each truth into its report (flat indices); none where none does."""

@@ -60,7 +60,7 @@ class Labels:
     jax.tree_util.register_dataclass,
     data_fields=[
         "successors", "probabilities", "features", "initial", "discount", "available",
-        "inflow_pairs", "inflow_probabilities",
+        "inflow_pairs", "inflow_slots",
     ],
     meta_fields=["labels"],
 )  # fmt: skip
@@ -86,9 +86,10 @@ class TabularMDP:
         ``gamma`` in (0, 1]; 1 only for finite horizons.
     available : bool ``[S, A]``
         Which actions exist in which state.
-    inflow_pairs, inflow_probabilities : ``[S, M]`` or None
-        The same transitions seen from the state they lead to (flat pair index and probability), kept
-        up to 10 000 states where no state has far more predecessors than the average.
+    inflow_pairs, inflow_slots : int ``[S, M]`` or None
+        The same transitions seen from the state they lead to: flat indices of the pair and of the entry of
+        ``probabilities`` (-1 on padding). Kept up to 10 000 states where no state has far more predecessors
+        than the average. The numbers are in ``probabilities`` alone, so that a derivative finds them all.
     labels : Labels
         Names.
     """
@@ -100,7 +101,7 @@ class TabularMDP:
     discount: Float[Array, ""]
     available: Bool[Array, "S A"]
     inflow_pairs: Int[Array, "S M"] | None
-    inflow_probabilities: Float[Array, "S M"] | None
+    inflow_slots: Int[Array, "S M"] | None
     labels: Labels = Labels()
 
     # -- construction ---------------------------------------------------------------------------------
@@ -188,7 +189,7 @@ class TabularMDP:
         successors = np.where(probabilities > 0, successors, np.arange(n_states)[:, None, None]).astype(
             np.int32
         )
-        inflow = _inflow(successors, probabilities)
+        inflow = _inflow(successors, available)
         return TabularMDP(
             successors=jnp.asarray(successors),
             probabilities=jnp.asarray(probabilities),
@@ -197,7 +198,7 @@ class TabularMDP:
             discount=jnp.asarray(float(discount)),
             available=jnp.asarray(available),
             inflow_pairs=None if inflow is None else jnp.asarray(inflow[0]),
-            inflow_probabilities=None if inflow is None else jnp.asarray(inflow[1]),
+            inflow_slots=None if inflow is None else jnp.asarray(inflow[1]),
             labels=labels,
         )
 
@@ -294,13 +295,21 @@ class TabularMDP:
         return replace(self, initial=initial)
 
     def with_probabilities(self, probabilities: Float[Array, "S A B"]) -> TabularMDP:
-        """The same successors with other chances (unchecked, so that it works under a trace).
+        """The same successors with other chances (unchecked, so that it works under a trace)."""
+        return replace(self, probabilities=probabilities)
 
-        Drops the inflow table, which repeats the numbers: derivatives in ``probabilities`` need one place.
-        """
-        return replace(self, probabilities=probabilities, inflow_pairs=None, inflow_probabilities=None)
+    def without_inflow(self) -> TabularMDP:
+        """The same process without its inflow table, whose width differs between processes of one size."""
+        return replace(self, inflow_pairs=None, inflow_slots=None)
 
     # -- the two directions of the dynamics -----------------------------------------------------------
+
+    @property
+    def inflow_probabilities(self) -> Float[Array, "S M"] | None:
+        """Probabilities of the transitions into each state, zero on padding; None without the table."""
+        if self.inflow_slots is None:
+            return None
+        return jnp.where(self.inflow_slots < 0, 0.0, self.probabilities.reshape(-1)[self.inflow_slots])
 
     def expect_next(self, values: Float[Array, " S"]) -> Float[Array, "S A"]:
         """Expected value after each pair, ``sum_s' P(s' | s, a) v(s')``."""
@@ -308,7 +317,7 @@ class TabularMDP:
 
     def push_forward(self, pairs: Float[Array, "S A"]) -> Float[Array, " S"]:
         """Mass on the next state from mass on pairs, ``sum_{s, a} x(s, a) P(s' | s, a)``."""
-        if self.inflow_pairs is not None and self.inflow_probabilities is not None:
+        if self.inflow_pairs is not None:
             return jnp.einsum("sm,sm->s", self.inflow_probabilities, pairs.reshape(-1)[self.inflow_pairs])
         flow = pairs[..., None] * self.probabilities
         return jax.ops.segment_sum(flow.reshape(-1), self.successors.reshape(-1), self.n_states)
@@ -439,11 +448,12 @@ def _check_transitions(
         )
 
 
-def _inflow(successors: np.ndarray, probabilities: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+def _inflow(successors: np.ndarray, available: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Pairs and entries that lead to each state; entries of probability zero too, which have derivatives."""
     n_states, _, width = successors.shape
     if n_states > _MAX_INFLOW_STATES:
         return None
-    source = np.flatnonzero(probabilities.ravel() > 0)
+    source = np.flatnonzero(np.repeat(available.ravel(), width))
     target = successors.ravel()[source]
     order = np.argsort(target, kind="stable")
     source, target = source[order], target[order]
@@ -453,7 +463,7 @@ def _inflow(successors: np.ndarray, probabilities: np.ndarray) -> tuple[np.ndarr
         return None
     slot = np.arange(len(source)) - np.repeat(np.cumsum(counts) - counts, counts)
     pairs = np.zeros((n_states, most), np.int32)
-    weights = np.zeros((n_states, most))
+    slots = np.full((n_states, most), -1, np.int32)
     pairs[target, slot] = source // width
-    weights[target, slot] = probabilities.ravel()[source]
-    return pairs, weights
+    slots[target, slot] = source
+    return pairs, slots

@@ -19,9 +19,10 @@ from jaxtyping import Array, Bool, Float, Int
 from numpyro.distributions import constraints
 from numpyro.distributions.util import validate_sample
 
-from .chain import filter_forward
+from .arguments import as_key
+from .chain import filter_all
 from .demonstration import PAD, SEEN, UNKNOWN
-from .evidence import Imperfection, _log, observe, require_fitting, step_log_evidence
+from .evidence import Imperfection, _log, checked_codes, fitting_sensor, observe, step_log_evidence
 from .mdp import TabularMDP
 from .occlusion import weights_prior
 from .planning import reward_of, simulate, soft_plan
@@ -77,7 +78,7 @@ def perceive(
     Both parts are padded to a multiple of eight, so that growing demonstrations meet few shapes. Not
     traceable.
     """
-    codes = np.asarray(codes)
+    sensor, codes = fitting_sensor(sensor, mdp), np.asarray(checked_codes(mdp, codes))
     distinct, row, repeats = np.unique(
         codes.reshape(len(codes), -1), axis=0, return_inverse=True, return_counts=True
     )
@@ -102,7 +103,7 @@ def perceive(
     return (
         Perceived(
             jnp.asarray(counts),
-            _dynamics(mdp, indifferent, seen.log_evidence, seen.live),
+            _dynamics(mdp, indifferent + seen.log_evidence, seen.live),
             others.log_evidence,
             others.live,
             jnp.asarray(np.concatenate(numbers)),
@@ -112,16 +113,9 @@ def perceive(
 
 
 def _passes(
-    mdp: TabularMDP,
-    log_policy: Float[Array, "S A"],
-    log_evidence: Float[Array, "h L S A"],
-    live: Bool[Array, "h L"],
+    mdp: TabularMDP, factors: Float[Array, "h L S A"], live: Bool[Array, "h L"]
 ) -> Float[Array, " h"]:
-    if not len(live):
-        return jnp.zeros(0)
-    return jax.vmap(lambda e, alive: filter_forward(mdp, e + log_policy, alive).log_likelihood)(
-        log_evidence, live
-    )
+    return filter_all(mdp, factors, live).log_likelihood if len(live) else jnp.zeros(0)
 
 
 _dynamics = jax.jit(_passes)
@@ -131,10 +125,7 @@ def trajectory_log_likelihoods(
     mdp: TabularMDP, log_policy: Float[Array, "S A"], perceived: Perceived
 ) -> Float[Array, " u"]:
     """Log-likelihood of each trajectory under one policy, hidden steps summed out."""
-    # An unavailable action has log-probability -inf, which zero visits must not turn into NaN.
-    finite = jnp.where(mdp.available, log_policy, 0.0)
-    seen = jnp.einsum("msa,sa->m", perceived.counts, finite) + perceived.dynamics
-    return jnp.concatenate([seen, _passes(mdp, log_policy, perceived.log_evidence, perceived.live)])
+    return component_log_likelihoods(mdp, log_policy[None], perceived)[0]
 
 
 def soft_policies(mdp: TabularMDP, weights: Float[Array, "T K"]) -> Float[Array, "T S A"]:
@@ -146,7 +137,14 @@ def component_log_likelihoods(
     mdp: TabularMDP, log_policies: Float[Array, "T S A"], perceived: Perceived
 ) -> Float[Array, "T u"]:
     """Log-likelihood of each trajectory under each policy."""
-    return jax.vmap(lambda policy: trajectory_log_likelihoods(mdp, policy, perceived))(log_policies)
+    # An unavailable action has log-probability -inf, which zero visits must not turn into NaN.
+    finite = jnp.where(mdp.available, log_policies, 0.0)
+    seen = jnp.einsum("msa,tsa->tm", perceived.counts, finite) + perceived.dynamics
+    # All passes of all policies at once: mapped over policies, each would be made in logarithms too.
+    factors = perceived.log_evidence + log_policies[:, None, None]
+    live = jnp.tile(perceived.live, (len(factors), 1))
+    passed = _passes(mdp, factors.reshape(-1, *factors.shape[2:]), live)
+    return jnp.concatenate([seen, passed.reshape(seen.shape[0], -1)], axis=1)
 
 
 def stick_proportions(sticks: Float[Array, " T-1"]) -> Float[Array, " T"]:
@@ -201,7 +199,7 @@ class MixtureLaw(dist.Distribution):
         *,
         validate_args: bool | None = None,
     ) -> None:
-        require_fitting(sensor, mdp)
+        sensor = fitting_sensor(sensor, mdp)
         if proportions.shape[-1:] != weights.shape[:1]:
             raise ValueError(
                 f"a mixture has a proportion for each row of weights, got shapes {proportions.shape} "
@@ -228,13 +226,13 @@ class MixtureLaw(dist.Distribution):
         shape = (*sample_shape, *self.batch_shape)
         chances = jnp.broadcast_to(jnp.log(self.proportions), (*shape, len(self.weights)))
         chances = chances.reshape(-1, len(self.weights))
-        codes = jax.vmap(one)(jax.random.split(key, len(chances)), chances)
+        codes = jax.vmap(one)(jax.random.split(as_key(key), len(chances)), chances)
         return codes.reshape((*shape, self.length, 3))
 
     @validate_sample
     def log_prob(self, value: Int[Array, "... L 3"]) -> Float[Array, "..."]:
         """Exact log-probability of what was perceived; ways and hidden steps summed out."""
-        value = jnp.asarray(value)
+        value = checked_codes(self.mdp, value)
         if value.shape[-2:] != (self.length, 3):
             raise ValueError(f"a value has shape [..., {self.length}, 3], got {value.shape}")
         perceived = as_evidence(self.mdp, self.sensor, value.reshape((-1, self.length, 3)))

@@ -19,6 +19,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from .agreement import PredicateClasses, ReportedMatches, predicate_classes
+from .arguments import as_key
 
 
 def observation_feature_model(
@@ -146,6 +147,7 @@ def sample_observation_features(
 
     Raises ``ValueError`` as the model does, and for numbers of draws or chains below one.
     """
+    key = as_key(key)
     for name, number in (("draws", draws), ("warmup", warmup), ("chains", chains)):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")

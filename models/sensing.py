@@ -14,6 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from .arguments import as_key, concrete, described, rebuilt_unchecked
+
 MOUNTAIN_CAR_SHIFT = 0.1 * 1.8 / 10
 """A tenth of a tenth of mountain car's range of positions, 1.8 (section 7.4.3)."""
 
@@ -214,9 +216,19 @@ class ContinuousSensor(Protocol):
         """Log-density or log-probability of the reports, given the truth, ``[...]`` in nats."""
 
 
+def require_continuous(sensor: Any) -> None:
+    """Raise ``TypeError`` for an object that neither samples reports nor weighs them."""
+    if isinstance(sensor, type) or not any(hasattr(sensor, x) for x in ("sample", "log_prob", "candidates")):
+        raise TypeError(
+            "sensor must be one of continuous recordings, such as GaussianSensor(0.1, 0.1) or ShiftSensor(); "
+            f"got {described(sensor)}"
+        )
+
+
 def distort(key: Array, sensor: ContinuousSensor, truth: Recording) -> Recording:
-    """What the sensor reports of a recording; padding stays as it is."""
-    observations, actions = sensor.sample(key, truth.observations, truth.actions)
+    """Replace a recording by what the sensor reports of it; padding stays as it is."""
+    require_continuous(sensor)
+    observations, actions = sensor.sample(as_key(key), truth.observations, truth.actions)
     live = truth.live[..., None]
     return truth._replace(
         observations=jnp.where(live, observations, truth.observations),
@@ -229,6 +241,7 @@ class _GaussianFields(NamedTuple):
     action_covariance: Float[Array, "*a"]
 
 
+@rebuilt_unchecked
 class GaussianSensor(_GaussianFields):
     """Reports normal about the truth, states and actions independently (section 6.2.3, Technique 2).
 
@@ -242,15 +255,13 @@ class GaussianSensor(_GaussianFields):
     Raises
     ------
     ValueError
-        For a covariance that is not finite, not symmetric or not positive definite. JAX's own arrays, of
-        which a compiled function makes sensors too, are only looked at where a learner is made.
+        For a covariance that is not finite, not symmetric or not positive definite.
     """
 
     __slots__ = ()
 
     def __new__(cls, state_covariance: ArrayLike, action_covariance: ArrayLike) -> GaussianSensor:
         """Check and convert both."""
-        # Only what a user would write is checked: JAX rebuilds this tuple around its own placeholders.
         return super().__new__(
             cls,
             checked_covariance("state", state_covariance),
@@ -259,9 +270,11 @@ class GaussianSensor(_GaussianFields):
 
     def sized(self, observation_size: int, action_size: int) -> GaussianSensor:
         """The same with matrices ``[d, d]`` and ``[k, k]``; ``ValueError`` where the sizes differ."""
-        return GaussianSensor(
-            covariance_matrix("state", self.state_covariance, observation_size),
-            covariance_matrix("action", self.action_covariance, action_size),
+        return GaussianSensor._make(
+            (
+                covariance_matrix("state", self.state_covariance, observation_size),
+                covariance_matrix("action", self.action_covariance, action_size),
+            )
         )
 
     def sample(
@@ -295,13 +308,13 @@ class GaussianSensor(_GaussianFields):
 
 
 def checked_covariance(whose: str, given: Any) -> Any:
-    """A covariance as somebody wrote it (number, diagonal, matrix) as an array; JAX's arrays as they are.
+    """Convert a covariance (number, diagonal or matrix) to an array; traced ones pass unchecked.
 
     Raises ``ValueError`` where it is not finite, not symmetric or not positive definite.
     """
-    if not isinstance(given, np.ndarray | np.generic | list | tuple | int | float):
-        return given
-    array = np.asarray(given, float)
+    array = concrete(f"the {whose} covariance", given)
+    if array is None:
+        return jnp.asarray(given, float)
     if array.ndim > 2 or (array.ndim == 2 and array.shape[0] != array.shape[1]):
         raise ValueError(
             f"the {whose} covariance must be a number, a diagonal [d] or a matrix [d, d], "
@@ -343,7 +356,13 @@ def log_normal(difference: Float[Array, "... d"], covariance: Float[Array, "d d"
     return -0.5 * jnp.sum(z**2, -1) - log_det - 0.5 * len(factor) * jnp.log(2 * jnp.pi)
 
 
-class ShiftSensor(NamedTuple):
+class _ShiftFields(NamedTuple):
+    shift: float | Array
+    probability: float | Array
+
+
+@rebuilt_unchecked
+class ShiftSensor(_ShiftFields):
     """Mountain car's noise: the position is now and then reported further along in the action's direction.
 
     With ``probability`` the first component is reported ``shift`` lower for actions 0 and 1 and ``shift``
@@ -351,14 +370,29 @@ class ShiftSensor(NamedTuple):
     "otherwise" is read as the truth, the only reading that sums to one). Positions are not cut to the
     track, so each truth has two reports wherever it lies; ``log_prob`` is that of the report among the two.
 
-    Fields
-    ------
+    Parameters
+    ----------
     shift : float, in units of position
     probability : float in [0, 1]
+
+    Raises
+    ------
+    ValueError
+        For a shift that is not finite, and for a probability outside [0, 1].
     """
 
-    shift: float | Array = MOUNTAIN_CAR_SHIFT
-    probability: float | Array = 0.25
+    __slots__ = ()
+
+    def __new__(
+        cls, shift: float | Array = MOUNTAIN_CAR_SHIFT, probability: float | Array = 0.25
+    ) -> ShiftSensor:
+        """Check both."""
+        by, p = concrete("shift", shift), concrete("probability", probability)
+        if by is not None and not (by.ndim == 0 and np.isfinite(by)):
+            raise ValueError(f"shift must be a finite number; got {described(shift)}")
+        if p is not None and not (p.ndim == 0 and 0 <= p <= 1):
+            raise ValueError(f"the probability of a shift must be in [0, 1], got {probability}")
+        return super().__new__(cls, shift, probability)
 
     def displacement(self, actions: Array) -> Float[Array, "..."]:
         """What a distorted report adds to the position, ``[...]``."""

@@ -10,9 +10,10 @@ from jaxtyping import Array, Bool, Float, Int
 from numpyro.distributions import constraints
 from numpyro.distributions.util import validate_sample
 
-from .chain import filter_forward
+from .arguments import as_key
+from .chain import filter_all
 from .demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration
-from .evidence import Imperfection, observe, require_fitting, step_log_evidence
+from .evidence import Imperfection, checked_codes, fitting_sensor, observe, step_log_evidence
 from .mdp import TabularMDP
 from .planning import reward_of, simulate, soft_plan
 
@@ -62,7 +63,8 @@ class TrajectoryLaw(dist.Distribution):
         Steps of an event, ``L``.
 
     Raises ``ValueError`` for discount 1, for a sensor made for another MDP, and for values of another
-    length.
+    length; ``log_prob`` raises :class:`DemonstrationError` for a value that names no state or action, unless
+    JAX traces it: then its log-probability is minus infinity.
     """
 
     arg_constraints = {"weights": constraints.real_vector}  # noqa: RUF012
@@ -78,7 +80,7 @@ class TrajectoryLaw(dist.Distribution):
         *,
         validate_args: bool | None = None,
     ) -> None:
-        require_fitting(sensor, mdp)
+        sensor = fitting_sensor(sensor, mdp)
         self.mdp, self.weights, self.sensor, self.length = mdp, weights, sensor, length
         self.log_policy = soft_plan(mdp, reward_of(mdp, weights)).log_policy
         super().__init__((), (length, 3), validate_args=validate_args)
@@ -99,27 +101,24 @@ class TrajectoryLaw(dist.Distribution):
         size = 1
         for n in sample_shape:
             size *= n
-        codes = jax.vmap(one)(jax.random.split(key, size))
+        codes = jax.vmap(one)(jax.random.split(as_key(key), size))
         return codes.reshape((*sample_shape, self.length, 3))
 
     @validate_sample
     def log_prob(self, value: Int[Array, "... L 3"]) -> Float[Array, "..."]:
         """Exact log-probability of what was perceived, hidden steps summed out."""
 
-        def one(codes: Int[Array, "L 3"]) -> Float[Array, ""]:
-            kind, state, action = codes[:, 0], codes[:, 1], codes[:, 2]
-            evidence = jax.vmap(
-                lambda k, s, a: step_log_evidence(
-                    self.sensor, self.mdp.n_states, self.mdp.n_actions, k, s, a, jnp.array(jnp.nan)
-                )
-            )(kind, state, action)
-            return filter_forward(self.mdp, evidence + self.log_policy, kind != PAD).log_likelihood
+        def evidence(code: Int[Array, " 3"]) -> Float[Array, "S A"]:
+            shape = (self.mdp.n_states, self.mdp.n_actions)
+            return step_log_evidence(self.sensor, *shape, code[0], code[1], code[2], jnp.array(jnp.nan))
 
-        value = jnp.asarray(value)
+        value = checked_codes(self.mdp, value)
         if value.shape[-2:] != (self.length, 3):
             raise ValueError(f"a value has shape [..., {self.length}, 3], got {value.shape}")
         flat = value.reshape((-1, self.length, 3))
-        return jax.vmap(one)(flat).reshape(value.shape[:-2])
+        factors = jax.vmap(jax.vmap(evidence))(flat) + self.log_policy
+        passed = filter_all(self.mdp, factors, flat[..., 0] != PAD)
+        return passed.log_likelihood.reshape(value.shape[:-2])
 
 
 def sample_demonstration(key: Array, law: TrajectoryLaw, n_trajectories: int) -> Demonstration:

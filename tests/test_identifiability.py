@@ -66,8 +66,9 @@ def derivative(function, point, step=1e-5):
 def with_features(mdp, features, names=None):
     features = np.where(np.asarray(mdp.available)[..., None], features, 0.0)
     # Without the inflow tables, whose width varies, random processes share compiled programs.
-    bare = mdp.with_probabilities(mdp.probabilities)
-    return replace(bare, features=jnp.asarray(features), labels=replace(mdp.labels, features=names))
+    return replace(
+        mdp.without_inflow(), features=jnp.asarray(features), labels=replace(mdp.labels, features=names)
+    )
 
 
 def small(mdp):
