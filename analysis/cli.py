@@ -571,13 +571,16 @@ def _progress(quiet: bool) -> Iterator[Any]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    from .text import printable
+
+    description = TextColumn("{task.description}", markup=False)
+    columns = (SpinnerColumn(), description, BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None)
 
         def advance(description: str, fraction: float | None) -> None:
             total = None if fraction is None else 1.0
-            bar.update(task, description=description, total=total, completed=fraction or 0.0)
+            bar.update(task, description=printable(description), total=total, completed=fraction or 0.0)
 
         yield advance
 
@@ -599,7 +602,9 @@ def _console() -> Console:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr)
+    from .text import printable
+
+    print(printable(text), file=sys.stderr)
 
 
 def _plain(value: Any) -> Any:
@@ -619,6 +624,8 @@ def _print_weights(mdp: TabularMDP, state: Any) -> None:
     import numpy as np
     from rich.table import Table
 
+    from .text import for_terminal
+
     weights = np.asarray(state.weights)
     table = Table(title=f"Reward after {int(state.session)} sessions")
     table.add_column("feature")
@@ -626,17 +633,19 @@ def _print_weights(mdp: TabularMDP, state: Any) -> None:
     table.add_column("L1-normalised", justify="right")
     scale = max(float(np.abs(weights).sum()), 1e-300)
     for name, weight in zip(mdp.feature_names, weights, strict=True):
-        table.add_row(name, f"{weight:.3f}", f"{weight / scale:.3f}")
+        table.add_row(for_terminal(name), f"{weight:.3f}", f"{weight / scale:.3f}")
     _console().print(table)
 
 
 def _print_history(view: Any, records: list[Any], last: int) -> None:
     from rich.table import Table
 
+    from .text import for_terminal
+
     origin = view.origin
     console = _console()
-    console.print(f"{origin.method} on an MDP of {origin.n_states} states and {origin.n_actions} actions; "
-                  f"{len(records)} sessions")  # fmt: skip
+    console.print(for_terminal(f"{origin.method} on an MDP of {origin.n_states} states and "
+                               f"{origin.n_actions} actions; {len(records)} sessions"))  # fmt: skip
     if not records:
         return
     table = Table(title=f"Last {min(last, len(records))} sessions")
@@ -654,7 +663,7 @@ def _print_history(view: Any, records: list[Any], last: int) -> None:
     for column in ("feature", "weight", "L1-normalised"):
         reward.add_column(column, justify="left" if column == "feature" else "right")
     for name, weight in zip(origin.feature_names, weights, strict=True):
-        reward.add_row(name, f"{weight:.3f}", f"{weight / scale:.3f}")
+        reward.add_row(for_terminal(name), f"{weight:.3f}", f"{weight / scale:.3f}")
     console.print(reward)
     if "agreement" in records[-1].report:
         sensor = Table(title="How often reports agree with the truth")
