@@ -114,7 +114,8 @@ _HOMES = {
         "regret_plot",
         "sure_bound",
     ),
-    "report": ("Picture", "Section", "Table", "write_report"),
+    "page": ("Lead", "Picture", "Section", "Table", "write_page"),
+    "provenance": ("provenance",),
     "selection": (
         "FeatureComparison",
         "compare_features",

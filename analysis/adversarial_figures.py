@@ -22,7 +22,19 @@ from .adversarial_results import (
     FrameStrip,
     RewardScatter,
 )
-from .style import SMALL, TEXT, TITLE, Theme, dress, foot, head, new_figure, series_style
+from .style import (
+    SMALL,
+    TEXT,
+    Theme,
+    dress,
+    dress_bar,
+    foot,
+    head,
+    headline,
+    method_styles,
+    new_figure,
+)
+from .text import counted
 
 DISSERTATION_RECOVERY = {"hopper": 0.78, "walker2d": 0.40, "half-cheetah": 0.61}
 """Share of the return lost to noise that robust-AIRL recovers in Table 7.3."""
@@ -32,8 +44,7 @@ MEASURED = {"returns": "return", "accuracy": "LBA"}
 
 
 def _style(theme: Theme, method: str) -> dict:
-    """A method looks the same in all figures."""
-    return series_style(theme, METHODS.index(method) if method in METHODS else len(METHODS))
+    return method_styles(theme, [method])[method]
 
 
 def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
@@ -85,8 +96,13 @@ def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
     handles = max((p.get_legend_handles_labels()[0] for p in panels), key=len)
     head(figure, theme, handles, title=results.title, columns=2)
     over = f"; LBA over {results.accuracy_over}" if "accuracy" in shown else ""
-    seeds = f"{results.seeds} seed{'s' * (results.seeds != 1)}"
-    foot(figure, theme, f"line: mean of {seeds}; band: its 95% interval (Student's){over}")
+    seeds = counted(results.seeds, "seed")
+    band = (
+        "line: one seed"
+        if results.seeds == 1
+        else f"line: mean of {seeds}; band: its 95% interval (Student's)"
+    )
+    foot(figure, theme, f"{band}{over}")
     return figure
 
 
@@ -200,14 +216,18 @@ def scatter_plot(scatters: Mapping[str, RewardScatter], theme: Theme, title: str
     foot(
         figure,
         theme,
-        f"{over.steps.n:,} steps of {over.trajectories.n:,} held-out trajectories; r: Pearson's, with a 95% "
-        "interval (trajectories drawn anew)",
+        f"{counted(over.steps.n, 'step')} of {counted(over.trajectories.n, 'held-out trajectory')}; r: "
+        "Pearson's, with a 95% interval (trajectories drawn anew)",
     )
     return figure
 
 
 def _told(found: Correlation) -> str:
+    if np.isnan(found.pearson):
+        return "r not defined, a reward is constant"
     ends = found.bootstrap
+    if np.isnan([ends.low, ends.high]).any():
+        return f"r = {found.pearson:.2f} (interval not known)"
     return f"r = {found.pearson:.2f} ({ends.low:.2f} to {ends.high:.2f})"
 
 
@@ -278,12 +298,8 @@ def cells_plot(
         panel.tick_params(axis="y", left=panel is panels[0])
     panels[0].set_ylabel("velocity (a step)", color=theme.ink, fontsize=TEXT)
     bar = figure.colorbar(picture, ax=list(panels), pad=0.01, fraction=0.03, format=PercentFormatter(1.0))
-    bar.set_label("share of equal actions", color=theme.ink, fontsize=TEXT)
-    bar.ax.tick_params(colors=theme.muted, labelcolor=theme.ink, labelsize=SMALL)
-    bar.outline.set_visible(False)
-    figure.suptitle(
-        "Where learned actions are the expert's", color=theme.ink, fontsize=TITLE + 0.5, x=0.01, ha="left"
-    )
+    dress_bar(bar, theme, "share of equal actions")
+    headline(figure, theme, "Where learned actions are the expert's")
     return figure
 
 
@@ -326,7 +342,7 @@ def frames_plot(strips: Sequence[FrameStrip], theme: Theme, title: str = "") -> 
         panel.set_ylim(-0.03 * tall, tall)
         panel.set_aspect("equal")
     if title:
-        figure.suptitle(title, color=theme.ink, fontsize=TITLE + 0.5, x=0.01, ha="left")
+        headline(figure, theme, title)
     return figure
 
 

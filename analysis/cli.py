@@ -127,11 +127,7 @@ def run_patrol(
             methods=None if method is Method.all else (method.value,), advance=advance,
         )  # fmt: skip
         patrol_study.write(study, report)
-    if as_json:
-        print(json.dumps(patrol_study.summary(study)))
-    else:
-        patrol_study.print_table(study, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(patrol_study, study, report, as_json)
 
 
 @run.command("labyrinth")
@@ -164,13 +160,8 @@ def run_labyrinth(
             ridge=labyrinth.RIDGE if ridge is None else ridge,
             on_bout=lambda view, number, bits: advance(f"{view}: bout {number}, {bits:.3f} bits", None),
         )  # fmt: skip
-        labyrinth.report(study, report)
-    if as_json:
-        print(json.dumps(labyrinth.summary(study)))
-        return
-    for table in labyrinth.tables(study):
-        _console().print(table)
-    print(f"Report: {report}")
+        labyrinth.write(study, report)
+    _tell(labyrinth, study, report, as_json)
 
 
 # -- bounds -------------------------------------------------------------------------------------------
@@ -223,11 +214,7 @@ def run_methods(
     with _reported_errors(), _progress(as_json) as advance:
         study = online_methods.study(instance, sessions=sessions, runs=runs, seed=seed, advance=advance)
         online_methods.write(study, report)
-    if as_json:
-        print(json.dumps(online_methods.summary(study)))
-    else:
-        online_methods.print_tables(study, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(online_methods, study, report, as_json)
 
 
 @run.command("label-bias")
@@ -245,11 +232,7 @@ def run_label_bias(
     with _reported_errors(), _progress(as_json) as advance:
         study = label_bias.study(worlds, trajectories, walls=walls, seed=seed, advance=advance)
         label_bias_report.write(study, report)
-    if as_json:
-        print(json.dumps(label_bias_report.summary(study)))
-    else:
-        label_bias_report.print_tables(study, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(label_bias_report, study, report, as_json)
 
 
 @run.command("sorting")
@@ -285,11 +268,7 @@ def run_sorting(
             methods=None if method is MultiTask.all else (method.value,),
         )  # fmt: skip
         sorting_report.write(study, report)
-    if as_json:
-        print(json.dumps(sorting_report.summary(study)))
-    else:
-        sorting_report.print_tables(study, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(sorting_report, study, report, as_json)
 
 
 @run.command("robust-airl")
@@ -317,11 +296,7 @@ def run_robust_airl(
             domain.value, seeds, sessions, noise, workers=workers, kept=kept, advance=advance
         )
         adversarial_answer.write(results, report)
-    if as_json:
-        print(json.dumps(adversarial_answer.summary(results)))
-    else:
-        adversarial_answer.print_tables(results, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(adversarial_answer, results, report, as_json)
 
 
 NoisyRuns = Annotated[int, typer.Option(min=1, help="Independent repetitions.")]
@@ -376,11 +351,7 @@ def _run_noisy(
             task, runs=runs, sessions=sessions, starts=starts.value, seed=seed, advance=advance, **options
         )
         noisy_report.write(study, report)
-    if as_json:
-        print(json.dumps(noisy_report.summary(study)))
-    else:
-        noisy_report.print_tables(study, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(noisy_report, study, report, as_json)
 
 
 # -- simulate -----------------------------------------------------------------------------------------
@@ -514,6 +485,17 @@ def show(
 
 
 # -- shared -------------------------------------------------------------------------------------------
+
+
+def _tell(teller: Any, study: Any, folder: Path, as_json: bool) -> None:
+    """Print a study's results: those of its page's ``results.json``, or its tables and where the page is."""
+    from .text import printable
+
+    if as_json:
+        print(json.dumps(json.loads((folder / "results.json").read_text(encoding="utf-8"))))
+        return
+    teller.print_tables(study, _console())
+    print(printable(f"Report: {folder / 'index.html'}"))
 
 
 def _decision_process(name: str, observability: int | None) -> tuple[TabularMDP, Imperfection]:

@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator
 from ..domains.patrol import FORWARD, LEFT, RIGHT, SECONDS_PER_STEP, STOP, Cell, Patrol, break_ties
 from ..models.planning import greedy_actions
 from .metrics import optimal_actions
-from .style import LIGHT, SMALL, TEXT, Theme, dress, new_figure
+from .style import LIGHT, SMALL, TEXT, Theme, dress, dress_bar, headline, new_figure
 
 _INCHES_PER_CELL = 0.46
 
@@ -72,10 +72,7 @@ def policy_map(
     _draw_key(legend, theme, patrol.breach is not None, view is not None)
     seen = "" if observability is None else f", {observability} % observability"
     share = f"{agrees.sum()} of {len(agrees)} states as the expert ({100 * agrees.mean():.1f} %)"
-    figure.suptitle(
-        f"{title}: {share}\n{patrol.name}{seen}",
-        color=theme.ink, fontsize=TEXT + 1.5, x=0.01, ha="left",
-    )  # fmt: skip
+    headline(figure, theme, f"{title}: {share}\n{patrol.name}{seen}", TEXT + 1.5)
     return figure
 
 
@@ -291,10 +288,8 @@ def hidden_path(
             labelcolor=theme.ink,
         )
     bar = figure.colorbar(image, ax=[strip, axes], pad=0.015, fraction=0.04, aspect=35)
-    bar.set_label("probability of the cell", color=theme.ink, fontsize=TEXT)
-    bar.ax.tick_params(colors=theme.muted, labelcolor=theme.ink, labelsize=SMALL)
-    bar.outline.set_edgecolor(theme.muted)
-    figure.suptitle(f"{title} ({patrol.name})", color=theme.ink, fontsize=TEXT + 1.5, x=0.01, ha="left")
+    dress_bar(bar, theme, "probability of the cell")
+    headline(figure, theme, f"{title} ({patrol.name})", TEXT + 1.5)
     return figure
 
 

@@ -31,7 +31,7 @@ from ..models.planning import deterministic_policy, hard_plan, reward_of
 from .figures import draw_band, set_scale
 from .metrics import optimal_actions, policy_accuracy, quantile_band
 from .report import Picture, Section, Table, write_report
-from .style import Theme, dress, foot, head, new_figure, save_themes
+from .style import Theme, dress, foot, head, method_styles, new_figure, save_themes
 
 if TYPE_CHECKING:
     import pandas
@@ -262,10 +262,11 @@ def draw(study: MethodsStudy, theme: Theme) -> Figure:
         families.setdefault(_family(curve.name), []).append(i)
     panels = np.atleast_1d(figure.subplots(1, len(families), sharey=True))
     handles = []
+    styles = method_styles(theme, [curve.name for curve in study.curves])
     for panel, (family, members) in zip(panels, families.items(), strict=True):
         for i in members:
             curve = study.curves[i]
-            draw_band(panel, theme, i, curve.name, study.points, curve.accuracy, 0.5)
+            draw_band(panel, styles[curve.name], curve.name, study.points, curve.accuracy, 0.5)
         handles += panel.get_legend_handles_labels()[0]
         if len(study.curves) - 1 not in members:
             level = np.median(reference.accuracy, axis=0)

@@ -30,7 +30,8 @@ from matplotlib.ticker import PercentFormatter
 from ..domains.sorting import Sorting
 from ..domains.sorting_line import Line, Share, Tally, sort_belts, wilson
 from .metrics import greedy_policy, optimal_actions, policy_accuracy
-from .style import LIGHT, TEXT, Theme, dress, foot, head, new_figure
+from .style import LIGHT, TEXT, Theme, dress, foot, head, name_ticks, new_figure
+from .text import counted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -219,7 +220,7 @@ def caption(table: SortingTable) -> str:
     """What the columns mean."""
     return (
         "TP, FP: blemished and good onions in the bin; TN, FN: good and blemished ones left on the table. "
-        f"Simulated: means of {table.belts:,} belts; dissertation: its one belt of 24 onions. In brackets: "
+        f"Simulated: means of {counted(table.belts, 'belt')}; dissertation: its one belt of 24 onions. In brackets: "
         f"{table.level:.0%} intervals, Wilson's for the latter. LBA: over states with a choice. "
         "The simulated line is calibrated to the dissertation's expert only."
     )
@@ -309,7 +310,7 @@ def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str 
             )  # fmt: skip
             panel.set_xlim(0, 1.02)
             panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-        panels[i, 0].set_yticks(range(len(methods)), methods, fontsize=TEXT)
+        name_ticks(panels[i, 0], "y", range(len(methods)), methods, fontsize=TEXT)
         panels[i, 0].set_ylim(len(methods) - 0.4, -0.6)
         panels[i, 1].tick_params(left=False)
     handles = [
@@ -320,7 +321,7 @@ def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str 
         ),
     ]  # fmt: skip
     head(figure, theme, handles, title=title)
-    belts = f"simulated: {table.belts:,} belts; dissertation: one belt, 24 onions"
+    belts = f"simulated: {counted(table.belts, 'belt')}; dissertation: one belt, 24 onions"
     foot(figure, theme, f"bars: {table.level:.0%} intervals; {belts}")
     return figure
 

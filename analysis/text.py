@@ -1,8 +1,8 @@
 """Text for readers: names of others made safe for each medium, numbers, and counted nouns.
 
-Names of states, actions, features and methods come from files and callers. A terminal would obey their control
-characters and Rich their brackets, a figure their dollar signs, and a page their angle brackets. Each medium
-has one function here: :func:`for_terminal`, :func:`for_figure`, :func:`for_page`.
+Names of states, actions, features and methods come from files and callers. A terminal would obey their
+control characters and Rich their brackets, a figure their dollar signs, and a page their angle brackets. Each
+medium has one function here: :func:`for_terminal`, :func:`for_figure`, :func:`for_page`.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def number(value: Real | float | None, digits: int = 3) -> str:
     multiples of a power of ten.
 
     >>> number(2214.3), number(0.012345), number(2.2e-16), number(7)
-    ('2,214', '0.0123', '2.20 × 10⁻¹⁶', '7')
+    ('2,214', '0.0123', '2.2 × 10⁻¹⁶', '7')
     """
     if value is None or math.isnan(value):
         return NOTHING
@@ -99,8 +99,12 @@ def number(value: Real | float | None, digits: int = 3) -> str:
     mantissa, exponent = f"{value:.{digits - 1}e}".split("e")
     power = int(exponent)
     if -4 <= power < 9:
-        return f"{value:,.{max(digits - 1 - power, 0)}f}"
-    return f"{mantissa} × 10{str(power).translate(_SUPERSCRIPTS)}"
+        return _without_zeros(f"{value:,.{max(digits - 1 - power, 0)}f}")
+    return f"{_without_zeros(mantissa)} × 10{str(power).translate(_SUPERSCRIPTS)}"
+
+
+def _without_zeros(decimal: str) -> str:
+    return decimal.rstrip("0").rstrip(".") if "." in decimal else decimal
 
 
 def counted(n: int, noun: str, plural: str | None = None) -> str:
