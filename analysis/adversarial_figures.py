@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -32,9 +33,10 @@ from .style import (
     head,
     headline,
     method_styles,
+    name_ticks,
     new_figure,
 )
-from .text import counted
+from .text import counted, for_figure, listed
 
 DISSERTATION_RECOVERY = {"hopper": 0.78, "walker2d": 0.40, "half-cheetah": 0.61}
 """Share of the return lost to noise that robust-AIRL recovers in Table 7.3."""
@@ -120,12 +122,24 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
     low, high = -0.25, 1.5
     for y, (result, method, found) in enumerate(rows):
         style = _style(theme, method)
+        if not math.isfinite(found.share):
+            axes.annotate(
+                f"not known: noise cost something in {found.lost:.0%} of resamples", (0.03, y), va="center",
+                xycoords=axes.get_yaxis_transform(), color=style["color"], fontsize=SMALL,
+            )  # fmt: skip
+            continue
         ends = np.clip([found.low, found.high], low, high)
         axes.plot(ends, [y, y], color=style["color"], linewidth=3, alpha=0.55, solid_capstyle="butt")
         if low <= found.share <= high:
             axes.plot(
                 found.share, y, linestyle="", marker=style["marker"], markersize=8, color=style["color"]
             )
+        else:  # beyond the axis, and said so
+            beyond = found.share > high
+            axes.annotate(
+                f"{found.share:.0%}", (high if beyond else low, y), (-12 if beyond else 12, 0), va="center",
+                textcoords="offset points", ha="right" if beyond else "left", color=theme.ink, fontsize=SMALL,
+            )  # fmt: skip
         for end, cut in ((found.low, found.low < low), (found.high, found.high > high)):
             if cut:  # the interval goes on
                 axes.plot(
@@ -139,15 +153,12 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
                 markeredgecolor=theme.ink, markeredgewidth=1.5,
             )  # fmt: skip
     dress(axes, theme, x="share of what noise cost that is won back", grid="x")
-    axes.set_yticks(
-        range(len(rows)),
-        # A domain's second row is told by its colour alone.
-        [
-            "" if i and r is rows[i - 1][0] else f"{r.title}: {MEASURED[r.measure]}"
-            for i, (r, _, _) in enumerate(rows)
-        ],
-        fontsize=TEXT,
-    )
+    # A domain's second row is told by its colour alone.
+    names = [
+        "" if i and r is rows[i - 1][0] else f"{r.title}: {MEASURED[r.measure]}"
+        for i, (r, _, _) in enumerate(rows)
+    ]
+    name_ticks(axes, "y", range(len(rows)), names, fontsize=TEXT)
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_xlim(low, high)
     axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
@@ -168,7 +179,9 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
     seeds = sorted({found.n for _, _, found in rows})
     foot(
         figure, theme,
-        f"bar: 95% interval, seeds drawn with replacement ({', '.join(map(str, seeds))} seeds)",
+        "one seed a row, no interval"
+        if seeds == [1]
+        else f"bar: 95% interval, seeds drawn with replacement ({listed([str(n) for n in seeds])} seeds)",
     )  # fmt: skip
     return figure
 
@@ -195,7 +208,7 @@ def scatter_plot(scatters: Mapping[str, RewardScatter], theme: Theme, title: str
         )  # fmt: skip
         dress(panel, theme, x="true reward a step", y="learned reward a step")
         panel.set_title(
-            f"{name}\nsteps: {_told(scatter.correlation.steps)}\n"
+            f"{for_figure(name)}\nsteps: {_told(scatter.correlation.steps)}\n"
             f"trajectories: {_told(scatter.correlation.trajectories)}",
             color=theme.ink, fontsize=TEXT, loc="left",
         )  # fmt: skip

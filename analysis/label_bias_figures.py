@@ -106,7 +106,8 @@ def draw_scatter(study: LabelBiasStudy, theme: Theme) -> Figure:
     foot(
         figure,
         theme,
-        f"{counted(study.birl.n, 'trajectory')}; rewards are whole numbers, on the left shown a little spread",
+        f"{counted(study.birl.n, 'trajectory')}; rewards are whole numbers, on the left shown a little spread"
+        "",
     )
     return figure
 
@@ -163,7 +164,8 @@ def draw_settings(study: LabelBiasStudy, theme: Theme) -> Figure:
                label="BIRL, a world"),
         Line2D([], [], linestyle="", marker="|", markersize=12, markeredgewidth=2.4, color=theme.ink,
                label="BIRL, median"),
-        Line2D([], [], linestyle="", marker=maxent["marker"], color=maxent["color"], label="MaxEnt, all worlds"),
+        Line2D([], [], linestyle="", marker=maxent["marker"], color=maxent["color"],
+               label="MaxEnt, all worlds"),
         band,
         printed,
     ]  # fmt: skip

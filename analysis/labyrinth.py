@@ -445,9 +445,9 @@ def tables(result: LabyrinthStudy) -> list[Table]:
                     "parameters",
                 ),
                 rows,
-                f"With the {view.view if outside else 'whole maze in view'}: bits per decision on bouts not yet "
-                f"seen, and how many more than {LEARNER} needs, bout by bout (95 % intervals over bouts). Once "
-                "learned: on the recording that was learned from. Parameters: free numbers.",
+                f"With the {view.view if outside else 'whole maze in view'}: bits per decision on bouts not "
+                f"yet seen, and how many more than {LEARNER} needs, bout by bout (95 % intervals over "
+                "bouts). Once learned: on the recording that was learned from. Parameters: free numbers.",
             )
         )
     return made
@@ -487,8 +487,8 @@ def _lead(result: LabyrinthStudy) -> Lead:
         trust = "Do not trust it: it does not predict better than choosing at random beyond chance."
     elif gap.high < 0:
         trust = (
-            f"Trust it for what the animal prefers, not as the best predictor: the table {best.method} predicts "
-            f"better {told}, so that habits are missing from this reward."
+            f"Trust it for what the animal prefers, not as the best predictor: the table {best.method} "
+            f"predicts better {told}, so that habits are missing from this reward."
         )
     else:
         trust = (
@@ -514,14 +514,14 @@ def _lead(result: LabyrinthStudy) -> Lead:
 
 def _text(result: LabyrinthStudy) -> str:
     views = [view.view for view in result.views]
-    return f"""Each bout is predicted before it is learned from, so that nothing is tested on what it taught. The \
-score is the code length of the animal's decisions, in bits; forced steps cost nobody anything. Learned with: \
-{listed(views)}.
+    return f"""Each bout is predicted before it is learned from, so that nothing is tested on what it taught. \
+The score is the code length of the animal's decisions, in bits; forced steps cost nobody anything. Learned \
+with: {listed(views)}.
 
 {LEARNER} learns a weight for each place reached and one each for turning round and going deeper. \
-{BY_LEVEL} has the latter for each level of the maze. The others count actions, from one on: over all steps or \
-over choices alone, given how a junction was entered, given that and its level, or given the node and the entry \
-(Markov). The discount is {number(float(result.maze.mdp.discount))}."""
+{BY_LEVEL} has the latter for each level of the maze. The others count actions, from one on: over all steps \
+or over choices alone, given how a junction was entered, given that and its level, or given the node and the \
+entry (Markov). The discount is {number(float(result.maze.mdp.discount))}."""
 
 
 def write(result: LabyrinthStudy, folder: Path | str) -> Path:
@@ -536,8 +536,8 @@ def write(result: LabyrinthStudy, folder: Path | str) -> Path:
         ),
         drawn(
             folder, "value", lambda theme: value_on_maze(result, theme),
-            "Learned value of every place, entered from above: orange ones are worth less than zero, blue ones "
-            "more. The maze is drawn as its environment draws it, home below.",
+            "Learned value of every place, entered from above: orange ones are worth less than zero, blue "
+            "ones more. The maze is drawn as its environment draws it, home below.",
             "The maze with every corridor shaded by the learned value of the place it leads to",
         ),
     ]  # fmt: skip

@@ -199,7 +199,7 @@ class _Prose:
         self._told: set[str] = set()
 
     def __call__(self, text: str) -> str:
-        """Escape text, spell acronyms out where they first stand, and set what stands in backticks as code."""
+        """Escape text, spell acronyms out where they first stand, set what stands in backticks as code."""
         return self.code(_ACRONYM.sub(self._spelled, text))
 
     @staticmethod

@@ -31,7 +31,7 @@ from .figures import (
 )
 from .identifiability import Identifiability, identifiability_of, identifiability_section
 from .maps import hidden_path, policy_map
-from .metrics import demonstration_log_likelihoods, evaluate
+from .metrics import chance_accuracy, demonstration_log_likelihoods, evaluate
 from .page import Lead, Section, Table, drawn, write_page
 from .page import print_tables as print_page_tables
 from .provenance import plain, provenance
@@ -51,8 +51,7 @@ DEFAULT_OBSERVABILITY = {1: 30, 2: 30, 3: 18}
 STEPS_PER_SESSION = 5
 # Numbers of trajectories at which batch is timed and judged.
 BATCH_POINTS = 7
-# Weight vectors drawn at random, and lengths that the true weights are stretched to.
-CHANCE_DRAWS = 200
+# Lengths that the true weights are stretched to.
 STRETCHES = 2.0 ** np.arange(-2, 14)
 
 Advance = Callable[[str, float | None], None]
@@ -196,7 +195,7 @@ def study(
         identifiability_of(patrol.mdp, view, demonstration, jnp.asarray(weights[-1]))
         for demonstration, weights in zip(known, first.weights[0], strict=False)
     )
-    chance = _chance(patrol, jax.random.fold_in(keys[0], CHANCE_DRAWS))
+    chance = chance_accuracy(jax.random.fold_in(keys[0], 200), patrol.mdp, jnp.asarray(patrol.weights))
     truth = TrueLikelihood(
         STRETCHES, _likelihoods(patrol, observability, STRETCHES[:, None] * np.asarray(patrol.weights))
     )
@@ -244,19 +243,9 @@ def _batch(batch: Any, key: jax.Array, demonstrations: Sequence[Demonstration]) 
 
 
 def _random(patrol: Patrol, key: jax.Array, demonstrations: Sequence[Demonstration]) -> _Learned:
-    weights = _random_weights(patrol, key, (patrol.patrollers, 1))
+    shape = (patrol.patrollers, 1, patrol.mdp.n_features)
+    weights = np.asarray(jax.random.uniform(key, shape, float, -0.99, 0.99))
     return _not_learned(weights, demonstrations)
-
-
-def _random_weights(patrol: Patrol, key: jax.Array, shape: tuple[int, ...]) -> Float[np.ndarray, "... K"]:
-    return np.asarray(jax.random.uniform(key, (*shape, patrol.mdp.n_features), float, -0.99, 0.99))
-
-
-def _chance(patrol: Patrol, key: jax.Array) -> Float[np.ndarray, " draws"]:
-    """LBA of weights that nobody learned: what an accuracy must be compared with."""
-    drawn = jnp.asarray(_random_weights(patrol, key, (CHANCE_DRAWS,)))
-    scores = lax.map(partial(evaluate, patrol.mdp, jnp.asarray(patrol.weights)), drawn, batch_size=16)
-    return np.asarray(scores.accuracy.overall)
 
 
 def _likelihoods(
@@ -512,14 +501,14 @@ def _text(study: Study) -> str:
     return f"""Settings: {_settings(study)}.
 
 Chance: of {counted(len(study.chance), "weight vector")} drawn at random, half have an LBA of at least \
-{_percent(median)}, and {_percent(_share_as_good(study))} have the {_percent(float(reached))} of {first.name} \
-or more. The row of random weights is one such draw a patroller and run.
+{_percent(median)}, and {_percent(_share_as_good(study))} have the {_percent(float(reached))} of \
+{first.name} or more. The row of random weights is one such draw a patroller and run.
 
 Likelihood: it is that of a policy which errs the less the longer its weights are, and the patrollers never \
 err. The true weights are given in no such units. As given they reach {number(study.truth.as_given)} nats a \
 trajectory, stretched {number(stretched)} times {number(best)}, and {first.name} {number(learned)}. Learned \
-weights maximise the likelihood of what was seen, their length included; the true weights maximise nothing, so \
-that a likelihood above theirs is no error."""
+weights maximise the likelihood of what was seen, their length included; the true weights maximise nothing, \
+so that a likelihood above theirs is no error."""
 
 
 def write(study: Study, folder: Path | str) -> Path:
@@ -553,8 +542,8 @@ def write(study: Study, folder: Path | str) -> Path:
         ))  # fmt: skip
         pictures.append(drawn(
             folder, "time", partial(_draw_time, study, learning),
-            "Learning time of all patrollers together, without compilation. Running batch after every session "
-            f"is summed by interpolation between the {BATCH_POINTS} points at which it was timed.",
+            "Learning time of all patrollers together, without compilation. Running batch after every "
+            f"session is summed by interpolation between the {BATCH_POINTS} points at which it was timed.",
             "Learning time against trajectories",
         ))  # fmt: skip
     rates = [

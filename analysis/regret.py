@@ -42,6 +42,7 @@ from ..models.mdp import TabularMDP
 from ..models.planning import reward_of, soft_plan
 from .metrics import quantile_band
 from .style import LIGHT, TEXT, Theme, dress, foot, head, method_styles, new_figure
+from .text import counted
 
 # -- what the expert does -----------------------------------------------------------------------------
 
