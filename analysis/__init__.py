@@ -117,7 +117,7 @@ _HOMES = {
         "sure_bound",
     ),
     "page": ("Lead", "Picture", "Section", "Table", "write_page"),
-    "provenance": ("provenance",),
+    "results": ("study_provenance",),
     "selection": (
         "FeatureComparison",
         "compare_features",

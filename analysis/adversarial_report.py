@@ -30,7 +30,7 @@ from .adversarial_results import (
 from .noisy_examples import Strip
 from .page import Lead, Picture, Section, Table, drawn, write_page
 from .page import print_tables as print_page_tables
-from .provenance import provenance
+from .results import study_provenance
 from .text import counted, listed
 
 if TYPE_CHECKING:
@@ -379,7 +379,7 @@ def write(
     for results in all_results:
         store_results(results, folder / f"{results.domain}.results.json")
     told = {
-        "provenance": provenance(int(all_results[0].settings.get("seed", 0))),
+        "provenance": study_provenance(int(all_results[0].settings.get("seed", 0))),
         "domains": [summary(results) for results in all_results],
     }
     title = "Learning through noisy perception, without features"

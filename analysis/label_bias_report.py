@@ -23,7 +23,7 @@ from .label_bias import (
 )
 from .page import Lead, Section, Table, drawn, write_page
 from .page import print_tables as print_page_tables
-from .provenance import plain, provenance
+from .results import plain, study_provenance
 from .text import counted, number
 
 if TYPE_CHECKING:
@@ -51,7 +51,7 @@ def _rows(study: LabelBiasStudy) -> list[dict[str, Any]]:
 
 def summary(study: LabelBiasStudy) -> dict[str, Any]:
     """Settings and results as plain data; None where no world has a correlation."""
-    told: dict[str, Any] = plain({"provenance": provenance(study.seed), **_summary(study)})
+    told: dict[str, Any] = plain({"provenance": study_provenance(study.seed), **_summary(study)})
     return told
 
 
@@ -147,9 +147,9 @@ def _told_of_birl(result: SettingResult) -> tuple[str, str]:
 
 def _text(study: LabelBiasStudy) -> str:
     first = study.results[0]
-    return f"""A world of 10 x 10 cells with {counted(study.walls, "wall")}, a desirable object in each of two \
-corners, deterministic moves. The law of maximum entropy makes a trajectory's log-likelihood its reward less a \
-constant, so the two correlate perfectly, whoever demonstrates.
+    return f"""A world of 10 x 10 cells with {counted(study.walls, "wall")}, a desirable object in each of \
+two corners, deterministic moves. The law of maximum entropy makes a trajectory's log-likelihood its reward \
+less a constant, so the two correlate perfectly, whoever demonstrates.
 
 Bayesian IRL normalises over actions in every state. Its log-likelihood is the sum of advantages times eta, \
 which grows with the reward, less what the choices met on the way cost, and at an object in a corner there \

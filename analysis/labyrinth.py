@@ -64,7 +64,7 @@ from .estimates import Estimates, laplace_errors
 from .information import complete_information
 from .page import Lead, Section, Table, drawn, write_page
 from .page import print_tables as print_page_tables
-from .provenance import plain, provenance
+from .results import plain, study_provenance
 from .text import counted, listed, number
 
 if TYPE_CHECKING:
@@ -395,7 +395,7 @@ def summary(result: LabyrinthStudy) -> dict[str, Any]:
             "values": dict(zip(mdp.state_names, view.learned.values.tolist(), strict=True)),
         }
     told: dict[str, Any] = plain({
-        "provenance": provenance(0),
+        "provenance": study_provenance(0),
         "recording": result.recording,
         "bouts": len(result.decisions),
         "decisions": int(result.decisions.sum()),
@@ -514,9 +514,9 @@ def _lead(result: LabyrinthStudy) -> Lead:
 
 def _text(result: LabyrinthStudy) -> str:
     views = [view.view for view in result.views]
-    return f"""Each bout is predicted before it is learned from, so that nothing is tested on what it taught. \
-The score is the code length of the animal's decisions, in bits; forced steps cost nobody anything. Learned \
-with: {listed(views)}.
+    return f"""Each bout is predicted before it is learned from, so that nothing is tested on what it \
+taught. The score is the code length of the animal's decisions, in bits; forced steps cost nobody anything. \
+Learned with: {listed(views)}.
 
 {LEARNER} learns a weight for each place reached and one each for turning round and going deeper. \
 {BY_LEVEL} has the latter for each level of the maze. The others count actions, from one on: over all steps \

@@ -135,17 +135,12 @@ def _draw_mark(axes: Axes, theme: Theme, row: float, column: float, letter: str)
             zorder=5,
         )
     )
+    # In a corner, which glyphs leave free: those of a cell stand at the middles of its sides.
     axes.text(
-        column,
-        row,
-        letter,
-        ha="center",
-        va="center",
-        color=theme.goal,
-        fontweight="bold",
-        fontsize=7.5,
-        zorder=6,
-    )
+        column - 0.29, row - 0.29, letter, ha="center", va="center_baseline", color=theme.goal,
+        fontweight="bold", fontsize=7.5, zorder=6,
+        bbox={"boxstyle": "square,pad=0.08", "facecolor": theme.surface, "edgecolor": "none", "alpha": 0.85},
+    )  # fmt: skip
 
 
 def _draw_floor(

@@ -33,7 +33,7 @@ from .noisy_study import (
 )
 from .page import Lead, Section, Table, drawn, write_page
 from .page import print_tables as print_page_tables
-from .provenance import plain, provenance
+from .results import plain, study_provenance
 from .sorting_table import SortingTable, caption, sorting_table_plot, sorting_table_summary
 from .style import Theme
 from .text import counted, number
@@ -50,7 +50,7 @@ TARGETS = {PLAIN: (1 / 6, 1 / 12), AVERAGED: (1 / 12, 1 / 24), STEPWISE: (1 / 12
 def summary(study: NoisyStudy) -> dict[str, Any]:
     """Settings and all measures as plain data."""
     told: dict[str, Any] = plain({
-        "provenance": provenance(study.seed),
+        "provenance": study_provenance(study.seed),
         "task": study.task.name,
         "starts": study.starts,
         "runs": study.runs,
@@ -308,8 +308,8 @@ def _text(study: NoisyStudy) -> str:
     )
     return f"""An expert acts optimally; every pair of its trajectories is reported, some of them wrongly. \
 The learner knows neither how often nor which. There {"is" if study.runs == 1 else "are"} \
-{counted(study.runs, "independent run")} of {counted(study.sessions, "session")} of {TRAJECTORIES} trajectories \
-of {STEPS} pairs; reports and calibrated scores are the same for every method.
+{counted(study.runs, "independent run")} of {counted(study.sessions, "session")} of {TRAJECTORIES} \
+trajectories of {STEPS} pairs; reports and calibrated scores are the same for every method.
 
 {bare}The sensor is judged by agreement probabilities: how often a predicate of a report is that of the \
 truth. The reliabilities that parametrise the sensor are no frequencies. Controls: the constant one half; \
@@ -333,9 +333,9 @@ def _lead(study: NoisyStudy) -> Lead:
     result, early = study.results[PLAIN], min(EARLY, study.sessions)
     final = float(result.accuracy[:, -1, 0].mean())
     learned = (
-        f"From {counted(study.sessions, 'session')} of {TRAJECTORIES} misreported trajectories each, "
-        f"{PLAIN}, learned a reward whose policy does as the expert in {number(100 * final)} % of the states "
-        "(LBA), and at the same time how often perception is right."
+        f"From {counted(study.sessions, 'session')} of {TRAJECTORIES} misreported trajectories each, RIMEO learned "
+        f"a reward whose policy does as the expert in {number(100 * final)} % of the states, and at the same "
+        "time how often perception is right."
     )
     reach = float(np.mean(study.chance >= final - 1e-9))
     chance = (

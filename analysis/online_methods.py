@@ -33,7 +33,7 @@ from .information import complete_information
 from .metrics import chance_accuracy, optimal_actions, policy_accuracy, quantile_band
 from .page import Lead, Section, Table, drawn, write_page
 from .page import print_tables as print_page_tables
-from .provenance import plain, provenance
+from .results import plain, study_provenance
 from .style import Theme, dress, foot, head, method_styles, new_figure
 from .text import counted, number
 
@@ -310,7 +310,13 @@ def draw(study: MethodsStudy, theme: Theme) -> Figure:
     panels[0].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     head(figure, theme, handles + compared, title=_title(study))
     streams = len(reference.accuracy)
-    foot(figure, theme, f"line: median; band: middle 50% of {counted(streams, 'patroller')} watched")
+    foot(
+        figure,
+        theme,
+        "line: one patroller"
+        if streams == 1
+        else f"line: median; band: middle 50% of {streams} patrollers watched",
+    )
     return figure
 
 
@@ -321,7 +327,7 @@ def _family(name: str) -> str:
 def summary(study: MethodsStudy) -> dict[str, Any]:
     """Settings, curves, sweeps and the live Table 8.1 as plain data."""
     told: dict[str, Any] = plain({
-        "provenance": provenance(study.seed),
+        "provenance": study_provenance(study.seed),
         "patrol": study.patrol.name,
         "sessions": study.sessions,
         "runs": study.runs,
@@ -414,18 +420,22 @@ def _lead(study: MethodsStudy) -> Lead:
     last = study.curves[-1]
     final = float(np.median(last.accuracy[:, -1]))
     reached = _pairs_to(study, last, 0.9)
+    name = last.name.split(",")[0]
     at = "never stays at 90 %" if reached is None else f"stays at 90 % or more from {reached} pairs on"
     quickest = [(pairs, c.name) for c in study.curves[:-1] if (pairs := _pairs_to(study, c, 0.9)) is not None]
-    others = f"; of the others {min(quickest)[1]} is the quickest, at {min(quickest)[0]}" if quickest else ""
+    others = f"; the quickest of the others does so from {min(quickest)[0]} on" if quickest else ""
     learned = (
-        f"From {counted(int(study.points[-1]), 'state-action pair')} of {study.patrol.name}, {last.name} "
-        f"learned a reward whose policy does as the expert in {number(100 * final)} % of the states (LBA), "
-        f"and {at}{others}."
+        f"From {counted(int(study.points[-1]), 'state-action pair')} of {study.patrol.name}, {name} learned a "
+        f"reward whose policy does as the expert in {number(100 * final)} % of the states, and {at}{others}."
     )
     reach = float(np.mean(study.chance >= final - 1e-9))
     streams = len(last.accuracy)
     trust = (
-        f"Trust differences that exceed the spread of {counted(streams, 'patroller')} watched, "
+        (
+            "Trust no small difference, since one patroller was watched, "
+            if streams == 1
+            else f"Trust differences that exceed the spread of {streams} patrollers watched, "
+        )
         + (
             f"and no accuracy by itself: {number(100 * reach, 2)} % of random weights reach that one"
             if reach > 0.05
@@ -438,7 +448,7 @@ def _lead(study: MethodsStudy) -> Lead:
     if found is None:
         return Lead(learned, trust)
     table = found.table(
-        f"Weights that {last.name} learned from the first stream, with intervals of the likelihood's "
+        f"Weights that {name} learned from the first stream, with intervals of the likelihood's "
         "curvature there. A reward is known up to its length, hence the shares.",
         np.asarray(study.patrol.weights),
     )

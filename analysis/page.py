@@ -15,7 +15,7 @@ from numbers import Real
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-from .provenance import plain
+from .results import plain
 from .style import Theme, save_themes
 from .text import for_page, for_terminal, number
 
@@ -142,7 +142,7 @@ def write_page(
     lead : Lead
     sections : sequence of Section
     results : mapping
-        The study as plain data, ``provenance`` among it (:func:`~i2rl.analysis.provenance.provenance`).
+        The study as plain data, ``provenance`` among it (:func:`~i2rl.analysis.results.study_provenance`).
 
     Raises
     ------

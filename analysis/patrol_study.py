@@ -34,7 +34,7 @@ from .maps import hidden_path, policy_map
 from .metrics import chance_accuracy, demonstration_log_likelihoods, evaluate
 from .page import Lead, Section, Table, drawn, write_page
 from .page import print_tables as print_page_tables
-from .provenance import plain, provenance
+from .results import plain, study_provenance
 from .style import Theme
 from .text import counted, listed, number
 
@@ -369,7 +369,7 @@ def summary(study: Study) -> dict[str, Any]:
         "by method, run and patroller": {m.name: m.weights[:, :, -1] for m in study.methods},
     }
     told: dict[str, Any] = plain({
-        "provenance": provenance(study.seed),
+        "provenance": study_provenance(study.seed),
         "patrol": study.patrol.name,
         "observability": study.observability,
         "sessions": study.sessions,

@@ -17,7 +17,7 @@ from .information import complete_information
 from .multi_task_metrics import match_ways
 from .page import Lead, Section, Table, drawn, write_page
 from .page import print_tables as print_page_tables
-from .provenance import plain, provenance
+from .results import plain, study_provenance
 from .sorting_study import BATCH, DPM, EM, EM_UNTOLD, FEW, METHODS, ONLINE, SortingStudy
 from .sorting_table import (
     HEADINGS,
@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 def summary(study: SortingStudy) -> dict[str, Any]:
     """Settings and all measures as plain data."""
     told: dict[str, Any] = plain({
-        "provenance": provenance(study.seed),
+        "provenance": study_provenance(study.seed),
         "process": study.sorting.name,
         "tasks": study.tasks,
         "behaviours": list(study.sorting.behaviours[: study.tasks]),
@@ -192,7 +192,7 @@ def _lead(study: SortingStudy) -> Lead:
     learned = (
         f"From one jumble of {counted(n, 'trajectory')} {result.name} learned {found} ways of sorting, where "
         f"{study.tasks} were demonstrated, put {number(100 * float(m.accuracy[:, -1].mean()))} % of the "
-        f"trajectories in the right one, and loses {number(lost)} of the value (EVD), where one way for all "
+        f"trajectories in the right one, and loses {number(lost)} of the value, where one way for all "
         f"loses {number(study.one_way)}."
     )
     known = right == study.runs and lost < 0.1 * study.one_way
@@ -201,8 +201,8 @@ def _lead(study: SortingStudy) -> Lead:
         f"Trust the ways and what they do ({spread}); the weights of experts who never err have no scale of "
         "their own, so trust their signs where an interval leaves zero out."
         if known
-        else f"Do not trust it as it is: the true number was found in {right} of {counted(study.runs, 'run')}, "
-        "and more trajectories may be needed."
+        else "Do not trust it as it is: the true number was found in "
+        f"{right} of {counted(study.runs, 'run')}, and more trajectories may be needed."
     )
     tables = [
         estimates.table(

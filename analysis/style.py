@@ -223,10 +223,13 @@ def head(
     figure: Figure, theme: Theme, handles: Sequence[Artist], *, title: str = "", columns: int = 3
 ) -> None:
     """Title and legend above all axes; one block, so that neither can cover the other."""
+    named: dict[str, Any] = (
+        {"labels": [for_figure(handle.get_label()) for handle in handles]} if handles else {}
+    )
     legend = figure.legend(
-        handles=list(handles), labels=[for_figure(handle.get_label()) for handle in handles],
-        title=for_figure(title) or None, loc="outside upper left", ncols=columns, frameon=False,
-        fontsize=TEXT, title_fontsize=TITLE + 0.5, alignment="left", labelcolor=theme.ink, borderaxespad=0.3,
+        handles=list(handles), **named, title=for_figure(title) or None, loc="outside upper left",
+        ncols=columns, frameon=False, fontsize=TEXT, title_fontsize=TITLE + 0.5, alignment="left",
+        labelcolor=theme.ink, borderaxespad=0.3,
     )  # fmt: skip
     legend.get_title().set_color(theme.ink)
 

@@ -1,4 +1,4 @@
-"""How a study came about: command line, seed and versions, as every ``results.json`` and page states them."""
+"""What a study's ``results.json`` is made of: plain data, and how it came about."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from ..version import __version__
 _COMPUTED_WITH = ("jax", "jaxlib", "numpy", "scipy")
 
 
-def provenance(seed: int) -> dict[str, Any]:
+def study_provenance(seed: int) -> dict[str, Any]:
     """Return version, command line, seed, and versions of what computes, as plain data.
 
-    >>> sorted(provenance(7))
+    >>> sorted(study_provenance(7))
     ['command', 'i2rl', 'python', 'seed', 'versions']
     """
     return {
