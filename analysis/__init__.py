@@ -49,6 +49,7 @@ _HOMES = {
         "success_rates",
         "weights_plot",
     ),
+    "estimates": ("Estimates",),
     "history": ("fleet_history", "run_history"),
     "identifiability": (
         "Identifiability",
@@ -65,6 +66,7 @@ _HOMES = {
         "Accuracy",
         "Evaluation",
         "LearningError",
+        "chance_accuracy",
         "demonstration_log_likelihoods",
         "evaluate",
         "greedy_policy",
@@ -114,7 +116,8 @@ _HOMES = {
         "regret_plot",
         "sure_bound",
     ),
-    "report": ("Picture", "Section", "Table", "write_report"),
+    "page": ("Lead", "Picture", "Section", "Table", "write_page"),
+    "results": ("study_provenance",),
     "selection": (
         "FeatureComparison",
         "compare_features",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -22,7 +23,20 @@ from .adversarial_results import (
     FrameStrip,
     RewardScatter,
 )
-from .style import SMALL, TEXT, TITLE, Theme, dress, foot, head, new_figure, series_style
+from .style import (
+    SMALL,
+    TEXT,
+    Theme,
+    dress,
+    dress_bar,
+    foot,
+    head,
+    headline,
+    method_styles,
+    name_ticks,
+    new_figure,
+)
+from .text import counted, for_figure, listed
 
 DISSERTATION_RECOVERY = {"hopper": 0.78, "walker2d": 0.40, "half-cheetah": 0.61}
 """Share of the return lost to noise that robust-AIRL recovers in Table 7.3."""
@@ -32,8 +46,7 @@ MEASURED = {"returns": "return", "accuracy": "LBA"}
 
 
 def _style(theme: Theme, method: str) -> dict:
-    """A method looks the same in all figures."""
-    return series_style(theme, METHODS.index(method) if method in METHODS else len(METHODS))
+    return method_styles(theme, [method])[method]
 
 
 def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
@@ -85,8 +98,13 @@ def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
     handles = max((p.get_legend_handles_labels()[0] for p in panels), key=len)
     head(figure, theme, handles, title=results.title, columns=2)
     over = f"; LBA over {results.accuracy_over}" if "accuracy" in shown else ""
-    seeds = f"{results.seeds} seed{'s' * (results.seeds != 1)}"
-    foot(figure, theme, f"line: mean of {seeds}; band: its 95% interval (Student's){over}")
+    seeds = counted(results.seeds, "seed")
+    band = (
+        "line: one seed"
+        if results.seeds == 1
+        else f"line: mean of {seeds}; band: its 95% interval (Student's)"
+    )
+    foot(figure, theme, f"{band}{over}")
     return figure
 
 
@@ -104,12 +122,24 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
     low, high = -0.25, 1.5
     for y, (result, method, found) in enumerate(rows):
         style = _style(theme, method)
+        if not math.isfinite(found.share):
+            axes.annotate(
+                f"not known: noise cost something in {found.lost:.0%} of resamples", (0.03, y), va="center",
+                xycoords=axes.get_yaxis_transform(), color=style["color"], fontsize=SMALL,
+            )  # fmt: skip
+            continue
         ends = np.clip([found.low, found.high], low, high)
         axes.plot(ends, [y, y], color=style["color"], linewidth=3, alpha=0.55, solid_capstyle="butt")
         if low <= found.share <= high:
             axes.plot(
                 found.share, y, linestyle="", marker=style["marker"], markersize=8, color=style["color"]
             )
+        else:  # beyond the axis, and said so
+            beyond = found.share > high
+            axes.annotate(
+                f"{found.share:.0%}", (high if beyond else low, y), (-12 if beyond else 12, 0), va="center",
+                textcoords="offset points", ha="right" if beyond else "left", color=theme.ink, fontsize=SMALL,
+            )  # fmt: skip
         for end, cut in ((found.low, found.low < low), (found.high, found.high > high)):
             if cut:  # the interval goes on
                 axes.plot(
@@ -123,15 +153,12 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
                 markeredgecolor=theme.ink, markeredgewidth=1.5,
             )  # fmt: skip
     dress(axes, theme, x="share of what noise cost that is won back", grid="x")
-    axes.set_yticks(
-        range(len(rows)),
-        # A domain's second row is told by its colour alone.
-        [
-            "" if i and r is rows[i - 1][0] else f"{r.title}: {MEASURED[r.measure]}"
-            for i, (r, _, _) in enumerate(rows)
-        ],
-        fontsize=TEXT,
-    )
+    # A domain's second row is told by its colour alone.
+    names = [
+        "" if i and r is rows[i - 1][0] else f"{r.title}: {MEASURED[r.measure]}"
+        for i, (r, _, _) in enumerate(rows)
+    ]
+    name_ticks(axes, "y", range(len(rows)), names, fontsize=TEXT)
     axes.set_ylim(len(rows) - 0.5, -0.5)
     axes.set_xlim(low, high)
     axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
@@ -152,7 +179,9 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
     seeds = sorted({found.n for _, _, found in rows})
     foot(
         figure, theme,
-        f"bar: 95% interval, seeds drawn with replacement ({', '.join(map(str, seeds))} seeds)",
+        "one seed a row, no interval"
+        if seeds == [1]
+        else f"bar: 95% interval, seeds drawn with replacement ({listed([str(n) for n in seeds])} seeds)",
     )  # fmt: skip
     return figure
 
@@ -179,7 +208,7 @@ def scatter_plot(scatters: Mapping[str, RewardScatter], theme: Theme, title: str
         )  # fmt: skip
         dress(panel, theme, x="true reward a step", y="learned reward a step")
         panel.set_title(
-            f"{name}\nsteps: {_told(scatter.correlation.steps)}\n"
+            f"{for_figure(name)}\nsteps: {_told(scatter.correlation.steps)}\n"
             f"trajectories: {_told(scatter.correlation.trajectories)}",
             color=theme.ink, fontsize=TEXT, loc="left",
         )  # fmt: skip
@@ -200,14 +229,18 @@ def scatter_plot(scatters: Mapping[str, RewardScatter], theme: Theme, title: str
     foot(
         figure,
         theme,
-        f"{over.steps.n:,} steps of {over.trajectories.n:,} held-out trajectories; r: Pearson's, with a 95% "
-        "interval (trajectories drawn anew)",
+        f"{counted(over.steps.n, 'step')} of {counted(over.trajectories.n, 'held-out trajectory')}; r: "
+        "Pearson's, with a 95% interval (trajectories drawn anew)",
     )
     return figure
 
 
 def _told(found: Correlation) -> str:
+    if np.isnan(found.pearson):
+        return "r not defined, a reward is constant"
     ends = found.bootstrap
+    if np.isnan([ends.low, ends.high]).any():
+        return f"r = {found.pearson:.2f} (interval not known)"
     return f"r = {found.pearson:.2f} ({ends.low:.2f} to {ends.high:.2f})"
 
 
@@ -278,12 +311,8 @@ def cells_plot(
         panel.tick_params(axis="y", left=panel is panels[0])
     panels[0].set_ylabel("velocity (a step)", color=theme.ink, fontsize=TEXT)
     bar = figure.colorbar(picture, ax=list(panels), pad=0.01, fraction=0.03, format=PercentFormatter(1.0))
-    bar.set_label("share of equal actions", color=theme.ink, fontsize=TEXT)
-    bar.ax.tick_params(colors=theme.muted, labelcolor=theme.ink, labelsize=SMALL)
-    bar.outline.set_visible(False)
-    figure.suptitle(
-        "Where learned actions are the expert's", color=theme.ink, fontsize=TITLE + 0.5, x=0.01, ha="left"
-    )
+    dress_bar(bar, theme, "share of equal actions")
+    headline(figure, theme, "Where learned actions are the expert's")
     return figure
 
 
@@ -326,7 +355,7 @@ def frames_plot(strips: Sequence[FrameStrip], theme: Theme, title: str = "") -> 
         panel.set_ylim(-0.03 * tall, tall)
         panel.set_aspect("equal")
     if title:
-        figure.suptitle(title, color=theme.ink, fontsize=TITLE + 0.5, x=0.01, ha="left")
+        headline(figure, theme, title)
     return figure
 
 

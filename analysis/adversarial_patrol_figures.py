@@ -17,7 +17,8 @@ from matplotlib.ticker import PercentFormatter
 
 from .adversarial_patrol import interval
 from .figures import set_scale
-from .style import SMALL, TEXT, Theme, dress, foot, head, new_figure, save_themes, series_style
+from .style import SMALL, TEXT, Theme, dress, foot, head, method_styles, new_figure, save_themes, series_style
+from .text import counted
 
 Results = Mapping[str, Mapping[str, Any]]
 
@@ -41,11 +42,12 @@ def noise_curves(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     panels = figure.subplots(1, 2, sharey=True)
     least = 0.9
     for panel, (memory, title) in zip(panels, _MEMORY.items(), strict=True):
-        for i, name in enumerate((CLEAN, NOISY, ROBUST, LEARNED, LME)):
+        for name in (CLEAN, NOISY, ROBUST, LEARNED, LME):
             one = _noise(results, name, 0.05 if name == CLEAN else level, 1.0 if name == LME else memory)
             if one is None:
                 continue
-            _draw_mean(panel, theme, i, name, np.array(one["pairs"]), np.array(one["accuracy"]))
+            style = method_styles(theme, [name])[name]
+            _draw_mean(panel, style, name, np.array(one["pairs"]), np.array(one["accuracy"]))
             least = min(least, float(np.mean(one["accuracy"], axis=0)[1:].min()))
         dress(panel, theme, title=title, x="state-action pairs seen")
         panel.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
@@ -55,7 +57,11 @@ def noise_curves(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     title = f"Patrol, {level:.0%} of forward moves and right turns misreported"
     head(figure, theme, list(shown.values()), title=title)
     runs = max(len(r["accuracy"]) for r in results["noise"].values() if "accuracy" in r)
-    foot(figure, theme, f"line: mean of {runs} runs; band: its 95% interval; the axis does not begin at zero")
+    foot(
+        figure,
+        theme,
+        f"line: mean of {counted(runs, 'run')}; band: its 95% interval; the axis does not begin at zero",
+    )
     return figure
 
 
@@ -72,10 +78,11 @@ def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
         found = [(x, _noise(results, name, x, memory)) for x in levels]
         values = [(x, interval(_last(one))) for x, one in found if one is not None]
         x, (mean, half) = np.array([x for x, _ in values]), np.array([v for _, v in values]).T
-        style = series_style(theme, i)
+        label = _with_memory(name, memory)
+        style = method_styles(theme, [label])[label]
         at = x + (i - 1.5) * 0.0025
         left.vlines(at, mean - half, np.minimum(mean + half, 1.0), color=style["color"], linewidth=1.4)
-        left.plot(at, mean, label=_with_memory(name, memory), linewidth=1.6, markersize=6, **style)
+        left.plot(at, mean, label=label, linewidth=1.6, markersize=6, **style)
     for memory, dash in ((0.0, (0, (2, 2))), (1.0, (0, (7, 2)))):
         clean = _noise(results, CLEAN, level, memory)
         if clean is not None:
@@ -84,6 +91,8 @@ def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     dress(left, theme, title=f"Accuracy, mean of the last {LAST} sessions", x="probability of a misreport")
     left.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     left.set_xticks(levels)
+    # One level alone is one place, however many methods stand side by side there.
+    left.set_xlim(min(levels) - 0.02, max(levels) + 0.02)
     left.set_ylabel("learned behaviour accuracy (share of states)", color=theme.ink, fontsize=TEXT)
     _breaches(right, results, theme, level)
     for axis in (left.yaxis, right.xaxis):
@@ -148,10 +157,11 @@ def view_curves(results: Results, theme: Theme, gail_memory: float = 0.0) -> Fig
                 continue
             accuracy = np.array(one["accuracy"])
             x = np.arange(1, accuracy.shape[1] + 1)
-            _draw_mean(panels[0, column], theme, i, f"{view} % in view", x, accuracy)
+            style = series_style(theme, i)
+            _draw_mean(panels[0, column], style, f"{view} % in view", x, accuracy)
             if view != 100:
                 lost = (full - accuracy) / full
-                _draw_mean(panels[1, column], theme, i, f"{view} % in view", x, lost)
+                _draw_mean(panels[1, column], style, f"{view} % in view", x, lost)
         # A line for each part of a name, or the titles of neighbours meet.
         told = name if name == LME else _with_memory(name, memory).replace(", ", "\n", 1)
         dress(panels[0, column], theme, title=told)
@@ -167,7 +177,11 @@ def view_curves(results: Results, theme: Theme, gail_memory: float = 0.0) -> Fig
         figure, theme, panels[0, 0].get_legend_handles_labels()[0],
         title="Patrol through a keyhole: online GAIL beside LME-I2RL",
     )  # fmt: skip
-    foot(figure, theme, f"line: mean of {len(full)} streams of 5 pairs a trajectory; band: its 95% interval")
+    foot(
+        figure,
+        theme,
+        f"line: mean of {counted(len(full), 'stream')} of 5 pairs a trajectory; band: its 95% interval",
+    )
     return figure
 
 
@@ -199,8 +213,8 @@ def _required(one: Mapping[str, Any] | None) -> Mapping[str, Any]:
     return one
 
 
-def _draw_mean(axes: Axes, theme: Theme, i: int, name: str, x: np.ndarray, runs: np.ndarray) -> None:
-    style, (mean, half) = series_style(theme, i), interval(runs)
+def _draw_mean(axes: Axes, style: Mapping[str, Any], name: str, x: np.ndarray, runs: np.ndarray) -> None:
+    mean, half = interval(runs)
     top = np.minimum(mean + half, 1.0)
     axes.fill_between(x, mean - half, top, color=style["color"], alpha=0.18, linewidth=0)
     every = max(len(x) // 7, 1)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Iterable, Sequence
 from functools import partial
@@ -29,8 +28,10 @@ from .adversarial_results import (
     store_results,
 )
 from .noisy_examples import Strip
-from .report import Picture, Section, Table, write_report
-from .style import save_themes
+from .page import Lead, Picture, Section, Table, drawn, write_page
+from .page import print_tables as print_page_tables
+from .results import study_provenance
+from .text import counted, listed
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -87,9 +88,10 @@ def learning_table(results: AdversarialResults) -> Table:
     return Table(
         headings,
         rows,
-        f"Mean of the last {kept} of {sessions} sessions (95 % interval over seeds)."
+        f"Mean of the last {kept} of {counted(sessions, 'session')} (95 % interval over seeds)."
         + "".join(
-            f" {name} learned from as much in {len(results.methods[name].pairs)} sessions." for name in fewer
+            f" {name} learned from as much in {counted(len(results.methods[name].pairs), 'session')}."
+            for name in fewer
         )
         + (f" LBA over {results.accuracy_over}." if "accuracy" in measures else "")
         + (" The dissertation's returns are of Table 7.3." if printed is not None else ""),
@@ -150,23 +152,28 @@ def correlation_table(results: AdversarialResults) -> Table:
 
 
 def ile_table(results: AdversarialResults) -> Table:
-    """Empirical ILE in both forms, beside Table 7.5."""
+    """Empirical ILE in both forms; of the onion task beside Table 7.5, which is of no other."""
+    published = TABLE_7_5 if results.domain == "onion" else {}
     rows = []
     for name, result in results.methods.items():
         if result.errors:
             columns = np.array([tuple(e) for e in result.errors]).T
             ours = [_with_interval(column, 1, 3) for column in columns]
             rows.append((name, *ours))
-        if name in TABLE_7_5:
-            demonstrated, generated, _ = TABLE_7_5[name]
+        if name in published:
+            demonstrated, generated, _ = published[name]
             theirs = empirical_ile(demonstrated, generated)
             rows.append((f"{name}: dissertation", *(f"{x:.3f}" for x in theirs)))
     return Table(
         ("method", "V_demo", "V_gen", "(V_demo - V_gen) / V_demo", "(V_gen - V_demo) / V_gen"),
         rows,
-        "Learned rewards through a sigmoid, means a step. The first form reproduces Table 7.5's last column, "
-        "the second is the equation as printed. Table 7.5 is of data of 64 dimensions that were never "
-        "released: its rows and ours are of different tasks and cannot be compared in size.",
+        "Learned rewards through a sigmoid, means a step; the second form is the equation as printed."
+        + (
+            " The first form reproduces Table 7.5's last column. Table 7.5 is of data of 64 dimensions that "
+            "were never released: its rows and ours are of different tasks and cannot be compared in size."
+            if published
+            else ""
+        ),
     )
 
 
@@ -221,6 +228,8 @@ def _with_interval(
     within: tuple[float, float] = (-math.inf, math.inf),
 ) -> str:
     band = seed_interval(scale * np.asarray(runs, float))
+    if np.isnan(band.mean):
+        return _NONE
     if np.isnan(band.low):
         return f"{band.mean:,.{digits}f}"
     low, high = np.clip([band.low, band.high], *within)
@@ -238,7 +247,12 @@ def _correlated(found: Sequence[Correlation]) -> tuple[str, str]:
         return of_values, of_ranks
     one = found[0]
     pairs = ((one.pearson, one.bootstrap), (one.spearman, one.spearman_bootstrap))
-    of_values, of_ranks = (f"{r:.2f} ({ends.low:.2f} to {ends.high:.2f})" for r, ends in pairs)
+    of_values, of_ranks = (
+        f"{r:.2f}"
+        if np.isnan([ends.low, ends.high]).any()
+        else f"{r:.2f} ({ends.low:.2f} to {ends.high:.2f})"
+        for r, ends in pairs
+    )
     return of_values, of_ranks
 
 
@@ -246,6 +260,8 @@ def _recovered(found: Recovery) -> str:
     if found.lost < 1 and not (math.isfinite(found.low) and math.isfinite(found.high)):
         told = "not known" if found.lost < 0.5 else f"{found.share:.0%}, interval not known"
         return f"{told}: noise cost something in {found.lost:.0%} of resamples only"
+    if found.n == 1:
+        return f"{found.share:.0%} (one seed, no interval)"
     return f"{found.share:.0%} ({found.low:.0%} to {found.high:.0%})"
 
 
@@ -272,16 +288,7 @@ def _tables(results: AdversarialResults) -> dict[str, Table]:
 
 def print_tables(results: AdversarialResults, console: Console) -> None:
     """Print all tables."""
-    from rich.table import Table as RichTable
-
-    console.print(f"{results.title}: {results.noise}", highlight=False)
-    for part in _tables(results).values():
-        table = RichTable(caption=part.caption, caption_justify="left")
-        for i, heading in enumerate(part.headings):
-            table.add_column(heading, justify="left" if i == 0 else "right")
-        for row in part.rows:
-            table.add_row(*map(str, row))
-        console.print(table)
+    print_page_tables(list(_tables(results).values()), console, f"{results.title}: {results.noise}")
 
 
 # -- plain data ---------------------------------------------------------------------------------------
@@ -355,7 +362,7 @@ def write(
     folder: Path | str,
     strips: Sequence[tuple[Strip, TabularMDP]] = (),
 ) -> Path:
-    """Write the report: ``index.html``, the pictures in both themes, ``results.json``, and raw results.
+    """Write the page: ``index.html``, the pictures in both themes, ``results.json``, and raw results.
 
     ``results.json`` is what :func:`summary` says of each domain; ``DOMAIN.results.json`` is read by
     :func:`.adversarial_results.load_results`. ``strips`` are trajectories of tabular tasks, with the
@@ -371,23 +378,59 @@ def write(
         sections.append(_strip_section(strip, mdp, folder, i))
     for results in all_results:
         store_results(results, folder / f"{results.domain}.results.json")
-    told = {"domains": [summary(results) for results in all_results]}
-    (folder / "results.json").write_text(json.dumps(told, indent=2) + "\n")
-    return write_report(folder, sections, title="Learning through noisy perception, without features")
+    told = {
+        "provenance": study_provenance(int(all_results[0].settings.get("seed", 0))),
+        "domains": [summary(results) for results in all_results],
+    }
+    title = "Learning through noisy perception, without features"
+    return write_page(folder, title, _lead(all_results), sections, told)
+
+
+def _lead(all_results: Sequence[AdversarialResults]) -> Lead:
+    learned, trust = [], []
+    for results in all_results:
+        measure, name = figures.MEASURED[results.measure], results.title
+        late = {
+            m: x.mean() for m in (CLEAN, NOISY, ROBUST) if (x := results.late(m, results.measure)) is not None
+        }
+        shown = [
+            f"{m} {100 * x:.0f} %" if results.measure == "accuracy" else f"{m} {x:,.{_digits(x)}f}"
+            for m, x in late.items()
+        ]
+        learned.append(f"in {name} {listed(shown)} ({measure})")
+        found = results.recovery()
+        if found is not None:
+            known = found.lost == 1 and math.isfinite(found.share)
+            trust.append(
+                f"in {name} {_recovered(found)} of what noise cost is won back"
+                if known
+                else f"in {name} these runs do not show that noise cost anything"
+            )
+    seeds = min(results.seeds for results in all_results)
+    few = f"Trust no difference as long as there is {counted(seeds, 'seed')} only"
+    if seeds > 1:
+        few = f"Trust differences beyond the spread of {counted(seeds, 'seed')}"
+    return Lead(
+        "Rewards were learned as networks, so there are no weights to list; after the last sessions they "
+        f"reach {'; '.join(learned)}.",
+        f"{'; '.join([few, *trust])}.",
+        [learning_table(results) for results in all_results],
+    )
 
 
 def _recovery_section(all_results: Sequence[AdversarialResults], folder: Path) -> Section:
-    paths = save_themes(partial(figures.recovery_plot, all_results), folder, "recovery")
     told = "Of what noise takes from AIRL, the share that a learner wins back who reckons with the noise."
-    return Section("What robustness recovers", "", [], [Picture(*paths, told, told)])
+    picture = drawn(folder, "recovery", partial(figures.recovery_plot, all_results), told, told)
+    return Section("What robustness recovers", "", [], [picture])
 
 
 def _strip_section(strip: Strip, mdp: TabularMDP, folder: Path, i: int) -> Section:
     from .noisy_figures import strip_plot
 
-    paths = save_themes(partial(strip_plot, strip, mdp), folder, f"strip-{i}")
-    picture = Picture(
-        *paths,
+    picture = drawn(
+        folder,
+        f"strip-{i}",
+        partial(strip_plot, strip, mdp),
         "A new trajectory with a misreport, as robust-AIRL of the first seed understands it in the end.",
         "Grid of pairs against steps shaded by posterior probability, with what was seen and what happened",
     )
@@ -405,8 +448,9 @@ _NOTES = {
 
 def _text(results: AdversarialResults) -> str:
     told = (
-        f"The expert's states and actions are reported with noise: {results.noise}. {results.seeds} "
-        "independent seeds; all methods of a seed see the same demonstrations and have equal budgets."
+        f"The expert's states and actions are reported with noise: {results.noise}. "
+        f"{counted(results.seeds, 'independent seed')}; all methods of a seed see the same demonstrations "
+        "and have equal budgets."
     )
     return "\n\n".join([told, *([_NOTES[results.domain]] if results.domain in _NOTES else [])])
 
@@ -415,14 +459,14 @@ def _sections(results: AdversarialResults, folder: Path) -> list[Section]:
     tables = _tables(results)
 
     def picture(name: str, draw: Any, told: str, description: str) -> Picture:
-        return Picture(*save_themes(draw, folder, f"{results.domain}-{name}"), told, description)
+        return drawn(folder, f"{results.domain}-{name}", draw, told, description)
 
     learning = picture(
         "learning", partial(figures.learning_plot, results),
         "Learning against the pairs seen (Figures 7.11 to 7.13). Axes need not begin at zero.",
         "Learned behaviour accuracy or return against reported pairs, a line a method",
     )  # fmt: skip
-    first = [tables[name] for name in ("learning", "recovery", "breaches", "errors") if name in tables]
+    first = [tables[name] for name in ("recovery", "breaches", "errors") if name in tables]
     sections = [Section(results.title, _text(results), first, [learning])]
     if results.cells:
         cells = picture(

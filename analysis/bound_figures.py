@@ -11,7 +11,8 @@ from matplotlib.lines import Line2D
 
 from .bounds import demonstrations_needed, table_7_1a
 from .coverage import Coverage
-from .style import LIGHT, SMALL, Theme, dress, foot, head, new_figure, series_style
+from .style import LIGHT, SMALL, Theme, dress, foot, head, name_ticks, new_figure, series_style
+from .text import counted, number
 
 _NAMES = {
     "theorem": "Theorem 2 (hidden steps sampled)",
@@ -74,7 +75,11 @@ def sample_size_plot(
     note = (
         "the curve shares the error equally; the table spends 0.05 on epsilon_s. " if n_features == 6 else ""
     )
-    foot(figure, theme, f"{note}{n_features} features, discount {discount:g}, confidence {confidence:g}")
+    foot(
+        figure,
+        theme,
+        f"{note}{counted(n_features, 'feature')}, discount {discount:g}, confidence {confidence:g}",
+    )
     return figure
 
 
@@ -91,12 +96,14 @@ def looseness_plot(rows: Sequence[Coverage], *, theme: Theme = LIGHT, title: str
     for height, row in zip(heights, rows, strict=True):
         axes.plot([row.quantile, row.bound], [height, height], color=theme.grid, linewidth=3, zorder=1)
         axes.annotate(
-            f"{row.looseness:.3g} times", (row.bound, height), (7, 0), textcoords="offset points",
+            f"{number(row.looseness)} times", (row.bound, height), (7, 0), textcoords="offset points",
             va="center", fontsize=SMALL, color=theme.muted,
         )  # fmt: skip
     axes.plot([r.quantile for r in rows], heights, linestyle="none", marker="o", color=theme.series[0])
     axes.plot([r.bound for r in rows], heights, linestyle="none", marker="s", color=theme.series[1])
-    axes.set_yticks(heights, [f"{r.result}\nn = {r.trajectories}, covered {r.covered:.1%}" for r in rows])
+    name_ticks(
+        axes, "y", heights, [f"{r.result}\nn = {r.trajectories:,}, covered {r.covered:.1%}" for r in rows]
+    )
     axes.set_xscale("log")
     low, high = axes.get_xlim()
     axes.set_xlim(low, high * (high / low) ** 0.14)
@@ -110,5 +117,5 @@ def looseness_plot(rows: Sequence[Coverage], *, theme: Theme = LIGHT, title: str
         )
     ]
     head(figure, theme, handles, title=title, columns=2)
-    foot(figure, theme, f"{rows[0].runs} simulated runs each")
+    foot(figure, theme, f"{counted(rows[0].runs, 'simulated run')} each")
     return figure

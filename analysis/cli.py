@@ -21,6 +21,7 @@ import typer
 from typer.core import TyperGroup
 
 if TYPE_CHECKING:
+    from jax.typing import ArrayLike
     from rich.console import Console
 
     from ..inference.journal import JournalView, SessionRecord
@@ -172,11 +173,7 @@ def run_patrol(
             methods=None if method is Method.all else (method.value,), advance=advance,
         )  # fmt: skip
         patrol_study.write(study, report)
-    if as_json:
-        print(json.dumps(patrol_study.summary(study)))
-    else:
-        patrol_study.print_table(study, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(patrol_study, study, report, as_json)
 
 
 @run.command("labyrinth")
@@ -205,13 +202,8 @@ def run_labyrinth(
             ridge=labyrinth.RIDGE if ridge is None else ridge,
             on_bout=lambda view, number, bits: advance(f"{view}: bout {number}, {bits:.3f} bits", None),
         )  # fmt: skip
-        labyrinth.report(study, report)
-    if as_json:
-        print(json.dumps(labyrinth.summary(study)))
-        return
-    for table in labyrinth.tables(study):
-        _console().print(table)
-    print(f"Report: {report}")
+        labyrinth.write(study, report)
+    _tell(labyrinth, study, report, as_json)
 
 
 # -- bounds -------------------------------------------------------------------------------------------
@@ -264,11 +256,7 @@ def run_methods(
     with _reported_errors(), _progress(as_json) as advance:
         study = online_methods.study(instance, sessions=sessions, runs=runs, seed=seed, advance=advance)
         online_methods.write(study, report)
-    if as_json:
-        print(json.dumps(online_methods.summary(study)))
-    else:
-        online_methods.print_tables(study, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(online_methods, study, report, as_json)
 
 
 @run.command("label-bias")
@@ -286,11 +274,7 @@ def run_label_bias(
     with _reported_errors(), _progress(as_json) as advance:
         study = label_bias.study(worlds, trajectories, walls=walls, seed=seed, advance=advance)
         label_bias_report.write(study, report)
-    if as_json:
-        print(json.dumps(label_bias_report.summary(study)))
-    else:
-        label_bias_report.print_tables(study, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(label_bias_report, study, report, as_json)
 
 
 @run.command("sorting")
@@ -326,11 +310,7 @@ def run_sorting(
             methods=None if method is MultiTask.all else (method.value,),
         )  # fmt: skip
         sorting_report.write(study, report)
-    if as_json:
-        print(json.dumps(sorting_report.summary(study)))
-    else:
-        sorting_report.print_tables(study, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(sorting_report, study, report, as_json)
 
 
 @run.command("robust-airl")
@@ -354,11 +334,7 @@ def run_robust_airl(
             domain.value, seeds, sessions, noise, workers=workers, kept=kept, advance=advance
         )
         adversarial_answer.write(results, report)
-    if as_json:
-        print(json.dumps(adversarial_answer.summary(results)))
-    else:
-        adversarial_answer.print_tables(results, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(adversarial_answer, results, report, as_json)
 
 
 NoisyRuns = Annotated[int, _count("Independent repetitions.")]
@@ -413,11 +389,7 @@ def _run_noisy(
             task, runs=runs, sessions=sessions, starts=starts.value, seed=seed, advance=advance, **options
         )
         noisy_report.write(study, report)
-    if as_json:
-        print(json.dumps(noisy_report.summary(study)))
-    else:
-        noisy_report.print_tables(study, _console())
-        print(f"Report: {report / 'index.html'}")
+    _tell(noisy_report, study, report, as_json)
 
 
 # -- simulate -----------------------------------------------------------------------------------------
@@ -594,6 +566,17 @@ def _print_sessions(view: JournalView, last: int | None) -> None:
 # -- shared -------------------------------------------------------------------------------------------
 
 
+def _tell(teller: Any, study: Any, folder: Path, as_json: bool) -> None:
+    """Print a study's results: those of its page's ``results.json``, or its tables and where the page is."""
+    from .text import printable
+
+    if as_json:
+        print(json.dumps(json.loads((folder / "results.json").read_text(encoding="utf-8"))))
+        return
+    teller.print_tables(study, _console())
+    print(printable(f"Report: {folder / 'index.html'}"))
+
+
 def _decision_process(name: str, observability: int | None) -> tuple[TabularMDP, Imperfection]:
     from ..models.evidence import Sensor, Visibility
 
@@ -650,13 +633,16 @@ def _progress(quiet: bool) -> Iterator[Any]:
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
 
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
+    from .text import printable
+
+    description = TextColumn("{task.description}", markup=False)
+    columns = (SpinnerColumn(), description, BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
         task = bar.add_task("starting", total=None)
 
         def advance(description: str, fraction: float | None) -> None:
             total = None if fraction is None else 1.0
-            bar.update(task, description=description, total=total, completed=fraction or 0.0)
+            bar.update(task, description=printable(description), total=total, completed=fraction or 0.0)
 
         yield advance
 
@@ -682,7 +668,9 @@ def _console() -> Console:
 
 
 def _say(text: str) -> None:
-    print(text, file=sys.stderr)
+    from .text import printable
+
+    print(printable(text), file=sys.stderr)
 
 
 def _plain(value: Any) -> Any:
@@ -699,27 +687,19 @@ def _plain(value: Any) -> Any:
 def _print_weights(mdp: TabularMDP, state: Any) -> None:
     if state is None:
         return
-    import numpy as np
-    from rich.table import Table
-
-    weights = np.asarray(state.weights)
-    table = Table(title=f"Reward after {int(state.session)} sessions")
-    table.add_column("feature")
-    table.add_column("weight", justify="right")
-    table.add_column("L1-normalised", justify="right")
-    scale = max(float(np.abs(weights).sum()), 1e-300)
-    for name, weight in zip(mdp.feature_names, weights, strict=True):
-        table.add_row(name, f"{weight:.3f}", f"{weight / scale:.3f}")
-    _console().print(table)
+    title = f"Reward after {int(state.session)} sessions"
+    _print_rewards(_console(), mdp.feature_names, state.weights, title)
 
 
 def _print_history(view: JournalView, records: list[SessionRecord]) -> None:
     from rich.table import Table
 
+    from .text import for_terminal
+
     origin = view.origin
     console = _console()
-    console.print(f"{origin.method} on an MDP of {origin.n_states} states and {origin.n_actions} actions; "
-                  f"{view.sessions} sessions")  # fmt: skip
+    console.print(for_terminal(f"{origin.method} on an MDP of {origin.n_states} states and "
+                               f"{origin.n_actions} actions; {view.sessions} sessions"))  # fmt: skip
     if not records:
         return
     table = Table(title=f"Last {len(records)} sessions")
@@ -733,7 +713,7 @@ def _print_history(view: JournalView, records: list[SessionRecord]) -> None:
     console.print(table)
     weights = records[-1].weights
     if weights.shape[-1:] == (len(origin.feature_names),) and weights.ndim <= 2:
-        _print_rewards(console, origin.feature_names, weights.reshape(-1, weights.shape[-1]))
+        _print_rewards(console, origin.feature_names, weights, "Reward weights")
     if "agreement" in records[-1].report:
         sensor = Table(title="How often reports agree with the truth")
         sensor.add_column("predicate")
@@ -743,11 +723,15 @@ def _print_history(view: JournalView, records: list[SessionRecord]) -> None:
         console.print(sensor)
 
 
-def _print_rewards(console: Console, names: Sequence[str], rewards: Any) -> None:
-    """A table of weights ``[n, K]``, a feature a row: two columns for each reward."""
+def _print_rewards(console: Console, names: Sequence[str], weights: ArrayLike, title: str) -> None:
+    """Print weights ``[K]`` or ``[n, K]`` as a table, a feature a row: two columns for each reward."""
+    import numpy as np
     from rich.table import Table
 
-    table = Table(title="Reward weights")
+    from .text import for_terminal
+
+    rewards = np.atleast_2d(np.asarray(weights))
+    table = Table(title=title)
     table.add_column("feature")
     scales = [max(float(abs(weights).sum()), 1e-300) for weights in rewards]
     for i in range(len(rewards)):
@@ -758,7 +742,7 @@ def _print_rewards(console: Console, names: Sequence[str], rewards: Any) -> None
         cells = [
             x for w, scale in zip(weights, scales, strict=True) for x in (f"{w:.3f}", f"{w / scale:.3f}")
         ]
-        table.add_row(name, *cells)
+        table.add_row(for_terminal(name), *cells)
     console.print(table)
 
 

@@ -27,7 +27,8 @@ from ..models.demonstration import PAD, SEEN
 from .diagnostics import InferenceDataError, require_posterior, summary
 from .maps import hidden_path
 from .predictive import predictive_check
-from .style import LIGHT, SMALL, TEXT, Theme, dress, foot, head, new_figure, series_style
+from .style import LIGHT, SMALL, TEXT, Theme, dress, foot, head, name_ticks, new_figure, series_style
+from .text import counted, for_figure, number
 
 _MOST_PANELS = 24
 # Vehtari, Gelman, Simpson, Carpenter and Bürkner (2021): split-R-hat below 1.01, 100 effective draws a chain.
@@ -119,7 +120,7 @@ def forest_plot(
         style = series_style(theme, c)
         _draw_bars(axes, one, y, coverage, 2.6, 4.5, color=style["color"], marker=style["marker"])
     dress(axes, theme, x=_WEIGHT, grid="x")
-    axes.set_yticks(rows, names, fontsize=TEXT, color=theme.ink)
+    name_ticks(axes, "y", rows, names, fontsize=TEXT, color=theme.ink)
     axes.tick_params(axis="y", length=0)
     axes.set_ylim(len(names) - 0.4, -0.6)
     for row in rows[:-1]:
@@ -142,15 +143,24 @@ def trace_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: str = ""
         for c in range(chains):
             style = series_style(theme, c)
             draws = values.isel(chain=c).values
-            x, density = az.kde(draws)
-            left.plot(x, density, color=style["color"], linestyle=style["linestyle"], linewidth=1.5)
+            if np.ptp(draws) > 0:
+                x, density = az.kde(draws)
+                left.plot(
+                    x,
+                    density / density.max(),
+                    color=style["color"],
+                    linestyle=style["linestyle"],
+                    linewidth=1.5,
+                )
+            else:  # a chain that never moves has no density
+                left.axvline(draws[0], color=style["color"], linestyle=style["linestyle"], linewidth=1.5)
             right.plot(values["draw"], draws, color=style["color"], linewidth=0.6, alpha=0.75)
         dress(left, theme, y="", x="", grid="x")
         dress(right, theme, grid="y")
         left.set_yticks([])
         left.spines["left"].set_visible(False)
         left.set_ylim(bottom=0)
-        right.set_title(names[k], color=theme.ink, fontsize=TEXT, loc="left", pad=3)
+        right.set_title(for_figure(names[k]), color=theme.ink, fontsize=TEXT, loc="left", pad=3)
         if diverging is not None and diverging.any():
             at = diverging.any("chain").values
             right.plot(
@@ -159,7 +169,9 @@ def trace_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: str = ""
             )  # fmt: skip
     grid[-1, 0].set_xlabel(_WEIGHT, color=theme.ink, fontsize=TEXT)
     grid[-1, 1].set_xlabel("draw", color=theme.ink, fontsize=TEXT)
-    figure.supylabel("density (left), weight in nats (right)", color=theme.ink, fontsize=TEXT)
+    figure.supylabel(
+        "density, each to its own height (left), weight in nats (right)", color=theme.ink, fontsize=TEXT
+    )
     handles: list[Any] = _chain_handles(theme, chains, lines=True)
     if diverging is not None and diverging.any():
         handles.append(
@@ -173,14 +185,15 @@ def trace_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: str = ""
 def rank_plot(idata: az.InferenceData, *, bins: int = 20, theme: Theme = LIGHT, title: str = "") -> Figure:
     """Ranks of each chain's draws among all draws: even where the chains explore the same distribution.
 
-    The band holds 95 % of the counts in one bin for independent draws. Raises ``ValueError`` for fewer than
+    Every panel has its own scale, up to its highest bar. The band holds 95 % of the counts in one bin for
+    independent draws. Raises ``ValueError`` for fewer than
     two bins.
     """
     if bins < 2:
         raise ValueError(f"ranks need at least 2 bins, got {bins}")
     weights = require_posterior(idata)
     names, (chains, draws) = _names(weights, most=_MOST_PANELS), weights.shape[:2]
-    figure, panels = _panels(theme, len(names), share=True)
+    figure, panels = _panels(theme, len(names))
     edges = np.linspace(0, chains * draws, bins + 1)
     # A bin holds its share of all ranks; which chains they are from is a draw without replacement.
     per_bin = chains * draws / bins
@@ -189,9 +202,12 @@ def rank_plot(idata: az.InferenceData, *, bins: int = 20, theme: Theme = LIGHT, 
         ranks = stats.rankdata(weights.isel(feature=k).values).reshape(chains, draws)
         axes.axhspan(low, high, color=theme.cell, linewidth=0)
         axes.axhline(draws / bins, color=theme.muted, linewidth=0.9)
+        # Twice the expected count at least, so that a panel in which all is well looks so.
+        highest = 2 * draws / bins
         for c in range(chains):
             style = series_style(theme, c)
             counts, _ = np.histogram(ranks[c] - 0.5, edges)
+            highest = max(highest, float(counts.max()))
             axes.stairs(
                 counts,
                 edges,
@@ -201,8 +217,7 @@ def rank_plot(idata: az.InferenceData, *, bins: int = 20, theme: Theme = LIGHT, 
                 linewidth=1.4,
             )
         dress(axes, theme, title=name, grid=None)
-        axes.set_xlim(edges[0], edges[-1])
-        axes.set_ylim(bottom=0)
+        axes.set(xlim=(edges[0], edges[-1]), ylim=(0, 1.06 * highest))
     _label_grid(panels, theme, "rank among all draws", "draws in a bin")
     handles = [
         *_chain_handles(theme, chains, lines=True),
@@ -226,33 +241,46 @@ def convergence_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: st
     y = np.arange(len(labels))
     blue, orange = series_style(theme, 0), series_style(theme, 1)
     dots: dict[str, Any] = {"linestyle": "none", "markersize": 7}
-    left.axvspan(_RHAT, max(_RHAT + 0.002, 1.15 * table["r_hat"].max()), color=theme.cell, linewidth=0)
+    # ArviZ gives draws that never change the effective size of as many independent ones.
+    frozen = np.ptp(weights.values, axis=(0, 1)).ravel() == 0
+    table.loc[frozen, ["r_hat", "ess_bulk", "ess_tail"]] = np.nan
+    known = table["r_hat"][np.isfinite(table["r_hat"])]
+    low, high = min([0.999, *known]), max([_RHAT + 0.002, *known])
+    left.set_xlim(low - 0.05 * (high - low), high + 0.05 * (high - low))
+    left.axvspan(_RHAT, left.get_xlim()[1], color=theme.cell, linewidth=0)
     left.plot(table["r_hat"], y, marker="o", color=theme.series[0], **dots)
-    if not table["r_hat"].notna().any():
+    if chains == 1:
         left.text(0.5, 0.5, "needs two chains", transform=left.transAxes, ha="center", color=theme.ink)
-    known = table["r_hat"].dropna()
-    left.set_xlim(min([0.999, *(known - 0.001)]), max([_RHAT + 0.002, *(known * 1.001)]))
+    for axes in (left, right):
+        for row in y[frozen]:
+            axes.text(
+                0.5, row, "stuck: every draw is the same", transform=axes.get_yaxis_transform(), ha="center",
+                va="center", color=theme.ink, fontsize=SMALL, fontweight="bold",
+            )  # fmt: skip
     for name, style in (("ess_bulk", blue), ("ess_tail", orange)):
         right.plot(table[name], y, marker=style["marker"], color=style["color"], **dots)
     limit = _ESS_PER_CHAIN * chains
     right.axvspan(0, limit, color=theme.cell, linewidth=0)
     right.axvline(chains * draws, color=theme.muted, linewidth=1, linestyle=(0, (2, 2)))
-    right.set_xlim(0, 1.08 * max(chains * draws, table[["ess_bulk", "ess_tail"]].max().max(), limit))
+    right.set_xlim(
+        0, 1.08 * np.nanmax([chains * draws, *table[["ess_bulk", "ess_tail"]].values.ravel(), limit])
+    )
     dress(left, theme, title="R-hat", x="split R-hat, rank-normalised", grid="both")
     dress(right, theme, title="Effective sample size", x="independent draws of equal worth", grid="both")
     left.xaxis.set_major_locator(MaxNLocator(5))
-    left.set_yticks(y, labels, fontsize=TEXT - 0.5, color=theme.ink)
+    name_ticks(left, "y", y, labels, fontsize=TEXT - 0.5, color=theme.ink)
     left.set_ylim(len(labels) - 0.5, -0.5)
     handles: list[Any] = [
-        Line2D([], [], marker=blue["marker"], color=blue["color"], **dots, label="R-hat; bulk ESS"),
-        Line2D([], [], marker=orange["marker"], color=orange["color"], **dots, label="tail ESS"),
-        Patch(color=theme.cell, label=f"sample longer: R-hat over {_RHAT}, ESS under {limit}"),
+        Line2D([], [], marker=blue["marker"], color=blue["color"], **dots, label="R-hat; bulk size"),
+        Line2D([], [], marker=orange["marker"], color=orange["color"], **dots, label="tail size"),
+        Patch(color=theme.cell, label=f"sample longer: R-hat over {_RHAT}, size under {limit}"),
         Line2D([], [], color=theme.muted, linewidth=1, linestyle=(0, (2, 2)), label="all draws"),
     ]
     head(figure, theme, handles, title=title, columns=4)
     diverging = _diverging(idata)
     count = "unknown" if diverging is None else f"{int(diverging.sum())}"
-    foot(figure, theme, f"{chains} chains of {draws} draws; divergent draws: {count}")
+    sampled = f"{counted(chains, 'chain')} of {counted(draws, 'draw')}"
+    foot(figure, theme, f"{sampled}; divergent draws: {count}; R-hat: ratio of pooled to within-chain spread")
     return figure
 
 
@@ -324,9 +352,10 @@ def predictive_plot(
     axes.plot(x[inside], observed[inside], **within)
     axes.plot(x[~inside], observed[~inside], **beyond)
     dress(axes, theme, x="state, by expected visits", y="steps seen", grid="y")
-    axes.set_xticks(
-        x, shown["visited_state"].values, rotation=90, fontsize=SMALL - 1 if len(x) > 40 else SMALL
-    )
+    name_ticks(
+        axes, "x", x, shown["visited_state"].values, rotation=90,
+        fontsize=SMALL - 1 if len(x) > 40 else SMALL,
+    )  # fmt: skip
     axes.set_xlim(-0.8, len(x) - 0.2)
     axes.set_ylim(bottom=-0.04 * max(high.max(initial=1), observed.max(initial=1)))
     axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
@@ -341,8 +370,9 @@ def predictive_plot(
     head(figure, theme, handles, title=title, columns=4)
     left_out = check.sizes["visited_state"] - len(order)
     p = float(check["discrepancy_p_value"])
-    note = f"Bayesian p-value of the whole (Freeman-Tukey): {p:.3g}"
-    foot(figure, theme, note + (f"; {left_out} states neither seen nor predicted" if left_out else ""))
+    note = f"Bayesian p-value of the whole (Freeman-Tukey): {number(p)}"
+    rest = f"; {counted(left_out, 'state')} neither seen nor predicted" if left_out else ""
+    foot(figure, theme, note + rest)
     return figure
 
 
@@ -359,11 +389,11 @@ def _names(weights: xr.DataArray, most: int = _MOST_PANELS) -> list[str]:
     return names
 
 
-def _panels(theme: Theme, n: int, *, share: bool = False) -> tuple[Figure, list[Axes]]:
+def _panels(theme: Theme, n: int) -> tuple[Figure, list[Axes]]:
     columns = min(n, 3)
     rows = -(-n // columns)
     figure = new_figure(theme, 3.15 * columns + 0.4 if n > 1 else 5.2, 2.25 * rows + 0.9)
-    grid = figure.subplots(rows, columns, squeeze=False, sharex=True, sharey=share)
+    grid = figure.subplots(rows, columns, squeeze=False, sharex=True)
     for axes in grid.ravel()[n:]:
         axes.set_axis_off()
     for axes in grid[-1, : n - columns * (rows - 1)]:

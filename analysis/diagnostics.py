@@ -127,7 +127,8 @@ def summary(idata: az.InferenceData, **options: Any) -> pd.DataFrame:
     """
     weights = require_posterior(idata, extra=_by_session(idata))
     # Unrounded, ArviZ's columns are of type object.
-    table = az.summary(idata, var_names=["weights"], round_to="none", **options).astype(float)
+    with np.errstate(invalid="ignore"):  # draws that are all the same have no R-hat
+        table = az.summary(idata, var_names=["weights"], round_to="none", **options).astype(float)
     divergences = xr.DataArray(np.nan)
     if "sample_stats" in idata.groups() and "diverging" in idata["sample_stats"]:
         divergences = idata["sample_stats"]["diverging"].sum(("chain", "draw"))

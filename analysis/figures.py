@@ -6,7 +6,7 @@ Each function returns a matplotlib ``Figure`` made of plain arrays, in the theme
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -18,7 +18,8 @@ from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, PercentF
 from scipy.stats import binomtest
 
 from .metrics import quantile_band
-from .style import LIGHT, TEXT, Theme, dress, foot, head, new_figure, series_style
+from .style import LIGHT, TEXT, Theme, dress, foot, head, method_styles, name_ticks, new_figure
+from .text import counted, for_figure
 
 
 class LearningCurve(NamedTuple):
@@ -51,9 +52,10 @@ def learning_curves(
     figure = new_figure(theme, 9.2, 4.1)
     figure.get_layout_engine().set(wspace=0.05)  # type: ignore[union-attr, call-arg]
     left, right = figure.subplots(1, 2)
-    for i, curve in enumerate(curves):
-        draw_band(left, theme, i, curve.method, curve.sessions, curve.accuracy, coverage)
-        draw_band(right, theme, i, curve.method, curve.sessions, curve.log_likelihood, coverage)
+    styles = method_styles(theme, [curve.method for curve in curves])
+    for curve in curves:
+        for axes, values in ((left, curve.accuracy), (right, curve.log_likelihood)):
+            draw_band(axes, styles[curve.method], curve.method, curve.sessions, values, coverage)
     if expert_log_likelihood is not None:
         right.axhline(
             expert_log_likelihood,
@@ -69,8 +71,7 @@ def learning_curves(
     for axes in (left, right):
         set_scale(axes, "x", x_scale)
     head(figure, theme, right.get_legend_handles_labels()[0], title=title)
-    runs = _span({len(np.atleast_2d(curve.accuracy)) for curve in curves})
-    foot(figure, theme, f"line: median; band: middle {coverage:.0%} of {runs} runs")
+    foot(figure, theme, _of_runs({len(np.atleast_2d(curve.accuracy)) for curve in curves}, coverage))
     return figure
 
 
@@ -96,18 +97,18 @@ def learning_time(
     """
     figure = new_figure(theme, 7.0, 4.4)
     axes = figure.subplots()
-    for i, time in enumerate(times):
+    styles = method_styles(theme, [time.method for time in times])
+    for time in times:
         if not (np.asarray(time.seconds) > 0).all():
             raise ValueError(
                 f"the seconds of {time.method} must be positive to be shown on a logarithmic scale"
             )
-        draw_band(axes, theme, i, time.method, time.trajectories, time.seconds, coverage)
+        draw_band(axes, styles[time.method], time.method, time.trajectories, time.seconds, coverage)
     dress(axes, theme, x="trajectories seen", y="learning time (s)")
     set_scale(axes, "x", "log")
     set_scale(axes, "y", "log")
     head(figure, theme, axes.get_legend_handles_labels()[0], title=title, columns=2)
-    runs = _span({len(np.atleast_2d(time.seconds)) for time in times})
-    foot(figure, theme, f"line: median; band: middle {coverage:.0%} of {runs} runs")
+    foot(figure, theme, _of_runs({len(np.atleast_2d(time.seconds)) for time in times}, coverage))
     return figure
 
 
@@ -165,13 +166,14 @@ def success_rates(
         panel.set_xlim(-0.02, 1.02)
         panel.set_xticks([0, 0.25, 0.5, 0.75, 1])
         panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-    panels[0].set_yticks(y, [rate.method for rate in rates], fontsize=TEXT)
+    name_ticks(panels[0], "y", y, [rate.method for rate in rates], fontsize=TEXT)
     panels[0].set_ylim(len(rates) - 0.4, -0.6)
     panels[0].set_ylabel("method", color=theme.ink, fontsize=TEXT)
     panels[1].tick_params(left=False)
     if title:
         head(figure, theme, [], title=title)
-    foot(figure, theme, f"bar: {confidence:.0%} Wilson interval of {_span(set(runs.tolist()))} runs a method")
+    trials = _counts(set(runs.tolist()), "trial")
+    foot(figure, theme, f"bar: {confidence:.0%} Wilson interval of {trials} a method")
     return figure
 
 
@@ -207,7 +209,7 @@ def weights_plot(
         color=theme.series[1],
     )  # fmt: skip
     dress(axes, theme, x="weight (share of the L1 norm)", y="feature", grid="x")
-    axes.set_yticks(y, list(feature_names))
+    name_ticks(axes, "y", y, feature_names)
     axes.set_ylim(len(truth) - 0.4, -0.6)
     style: dict[str, Any] = {"linestyle": "none", "markersize": 8}
     learned_label = (
@@ -226,14 +228,13 @@ def weights_plot(
 
 def draw_band(
     axes: Axes,
-    theme: Theme,
-    i: int,
+    style: Mapping[str, Any],
     method: str,
     x: Int[np.ndarray, " T"],
     runs: Float[np.ndarray, "seeds T"],
     coverage: float,
 ) -> None:
-    """The ``i``-th method's median over runs as a line, and a band that holds ``coverage`` of them.
+    """Draw a method's median over runs as a line in its style, and a band that holds ``coverage`` of them.
 
     Raises ``ValueError`` for runs of another length than ``x``.
     """
@@ -241,12 +242,12 @@ def draw_band(
     if x.ndim != 1 or runs.shape[1:] != x.shape:
         raise ValueError(f"{method}: runs of shape {runs.shape} do not fit {x.shape} points along the axis")
     band = quantile_band(runs, coverage)
-    style = series_style(theme, i)
     if len(runs) > 1:
         axes.fill_between(x, band.low, band.high, color=style["color"], alpha=0.18, linewidth=0)
     axes.plot(
-        x, band.median, label=method, linewidth=1.8, markersize=5, markevery=max(len(x) // 8, 1), **style
-    )
+        x, band.median, label=for_figure(method), linewidth=1.8, markersize=5,
+        markevery=max(len(x) // 8, 1), **style,
+    )  # fmt: skip
 
 
 def set_scale(axes: Axes, which: str, scale: str) -> None:
@@ -266,6 +267,13 @@ def _direction(weights: Float[np.ndarray, "n K"]) -> Float[np.ndarray, "n K"]:
     return weights / norm
 
 
-def _span(counts: set[int]) -> str:
+def _of_runs(runs: set[int], coverage: float) -> str:
+    """Small print of a figure of medians and bands."""
+    if runs == {1}:
+        return "line: one run"
+    return f"line: median; band: middle {coverage:.0%} of {_counts(runs, 'run')}"
+
+
+def _counts(counts: set[int], noun: str) -> str:
     low, high = min(counts), max(counts)
-    return f"{low}" if low == high else f"{low} to {high}"
+    return counted(low, noun) if low == high else f"{low:,} to {counted(high, noun)}"

@@ -31,9 +31,11 @@ from ..models.demonstration import SEEN, Demonstration
 from ..models.evidence import Imperfection, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted, reward_of, soft_plan
+from .estimates import Estimates
 from .information import observed_information, total_log_likelihoods
 from .invariance import NOT_VISITED, WEAK, Direction, combination, sparse_basis, unidentified_directions
-from .report import Section, Table
+from .page import Section, Table
+from .text import number
 
 # Coefficients below this share of the largest are left out of the wording of a weak direction.
 _MINOR = 0.15
@@ -68,6 +70,11 @@ class Identifiability(NamedTuple):
     weak: tuple[Direction, ...]
     scale: float
     length_loss: tuple[float, float]
+
+    @property
+    def estimates(self) -> Estimates:
+        """The weights with their standard errors."""
+        return Estimates(self.features, self.weights, self.standard_errors)
 
     @property
     def directions(self) -> tuple[Direction, ...]:
@@ -213,10 +220,18 @@ def _sides(loss: tuple[float, float], scale: float) -> str:
     up, down = loss
     # Half a nat is one standard error of a weight that is determined.
     if up > 0.5 >= down:
-        return f"it may fall by {scale:g} at {max(down, 0):.2g} nats, but not rise ({up:.2g} nats)"
+        return (
+            f"it may fall by {scale:g} at {number(max(down, 0), 2)} nats, but not rise ({number(up, 2)} nats)"
+        )
     if down > 0.5 >= up:
-        return f"it may rise by {scale:g} at {max(up, 0):.2g} nats, but not fall ({down:.2g} nats)"
-    return f"a rise by {scale:g} costs {up:.2g} nats, a fall {down:.2g}"
+        return (
+            f"it may rise by {scale:g} at {number(max(up, 0), 2)} nats, but not fall ({number(down, 2)} nats)"
+        )
+    return f"a rise by {scale:g} {_cost(up)} nats, a fall {_cost(down)}"
+
+
+def _cost(loss: float) -> str:
+    return f"{'costs' if loss >= 0 else 'gains'} {number(abs(loss), 2)}"
 
 
 # -- for readers --------------------------------------------------------------------------------------
@@ -240,7 +255,8 @@ def describe_identifiability(result: Identifiability) -> str:
             f"{result.scale:g}:"
         )
         lines += [
-            f"- {d.kind} (standard error {d.standard_error:.2g}): {d.description}." for d in result.weak
+            f"- {d.kind} (standard error {number(d.standard_error, 2)}): {d.description}."
+            for d in result.weak
         ]
     else:
         lines.append(f"These demonstrations determine the others, each to within {result.scale:g}.")
@@ -248,7 +264,9 @@ def describe_identifiability(result: Identifiability) -> str:
 
 
 def _length(result: Identifiability) -> str:
-    halved, doubled = (f"loses {x:.2g}" if x > 0 else f"gains {abs(x):.2g}" for x in result.length_loss)
+    halved, doubled = (
+        f"loses {number(x, 2)}" if x > 0 else f"gains {number(abs(x), 2)}" for x in result.length_loss
+    )
     text = f"Halving all weights {halved} nats of likelihood, doubling them {doubled}."
     if result.length_loss[1] < -1e-9:
         text += " The expert errs too rarely to bound the weights' common length from above."
@@ -277,27 +295,23 @@ def directions_table(result: Identifiability) -> pd.DataFrame:
 
 
 def identifiability_section(results: Mapping[str, Identifiability]) -> Section:
-    """A section of a report on one demonstration or several, keyed by a title each."""
+    """Make a section of a page on one demonstration or several, keyed by whose they are."""
     tables = []
     for title, result in results.items():
-        weights = [
-            (name, f"{weight:.2f}", f"{error:.2g}" if np.isfinite(error) else "not determined")
-            for name, weight, error in zip(
-                result.features, result.weights, result.standard_errors, strict=True
-            )
-        ]
-        tables.append(Table(("feature", "weight", "standard error"), weights, f"{title}: weights"))
         if result.directions:
             found = [
-                (d.kind, "none" if d.exact else f"{d.standard_error:.2g}", d.description)
+                (d.kind, "none" if d.exact else number(d.standard_error, 2), d.description)
                 for d in result.directions
             ]
-            caption = f"{title}: directions not determined (without a standard error: by no amount of data)"
+            caption = (
+                f"Directions of the weights of {title} that are not determined; one without a standard error "
+                "is determined by no amount of data."
+            )
             tables.append(Table(("kind", "standard error", "direction"), found, caption))
     text = (
         "Behaviour determines a reward only up to changes that leave the behaviour alone. Where a direction "
         "of the weights changes no behaviour at all, no amount of watching would tell. Where it is weakly "
         "determined, prior belief decides: quite different weights explain what was seen as well.\n\n"
-        + "\n\n".join(f"{title[:1].upper()}{title[1:]}. {_length(r)}" for title, r in results.items())
+        + "\n\n".join(f"{title[:1].upper()}{title[1:]}: {_length(r)}" for title, r in results.items())
     )
     return Section("What the demonstrations determine", text, tables)

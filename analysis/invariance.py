@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float
 from ..models.mdp import TabularMDP
 from ..models.planning import features_to_go, reachable_states, require_discounted, soft_plan
 from .information import policy_sensitivity
+from .text import number
 
 NEVER_ACTIVE, DUPLICATE, COLLINEAR, CONSTANT = "never active", "duplicate", "collinear", "constant"
 SHAPING, NOT_VISITED, WEAK = "potential shaping", "not visited", "weakly determined"
@@ -182,7 +183,7 @@ def combination(features: Sequence[str], vector: Float[np.ndarray, " K"], least:
         if abs(value) < least:
             continue
         sign = ("-" if not words else " - ") if value < 0 else ("" if not words else " + ")
-        amount = "" if abs(abs(value) - 1) < 5e-4 else f"{abs(value):.3g} "
+        amount = "" if abs(abs(value) - 1) < 5e-4 else f"{number(abs(value))} "
         words += f"{sign}{amount}`{name}`"
     return words
 
@@ -208,7 +209,7 @@ def _named(
         ratio = -first / second
         same = abs(ratio - 1) < 1e-6
         copy = "the same as" if same else f"{ratio:.3g} times"
-        total = f"{names[0]}` + {'' if same else f'{ratio:.3g} '}`{names[1]}"
+        total = f"{names[0]}` + {'' if same else f'{number(ratio)} '}`{names[1]}"
         text = f"`{names[1]}` is {copy} `{names[0]}`: only the weights' sum `{total}` matters"
     elif kind is None:
         kind = COLLINEAR

@@ -25,6 +25,7 @@ from ..domains.sorting_line import Share, wilson
 from ..inference.boltzmann import boltzmann_log_policy, optimal_action_values
 from ..models.mdp import Labels, TabularMDP
 from ..models.planning import finite_soft_plan, greedy_actions, reward_of
+from .text import number
 
 Advance = Callable[[str, float | None], None]
 # What the dissertation prints for Bayesian IRL.
@@ -367,7 +368,7 @@ def quantiles(rho: Float[np.ndarray, " worlds"]) -> tuple[float, float, float]:
 
 
 def tell_p(p: float) -> str:
-    """A p-value to four digits; a smaller one as the power of ten it is below."""
+    """Write a p-value to four digits; a smaller one as the power of ten it is below."""
     if p >= 1e-4:
         return f"{p:.4f}"
-    return f"< 1e{int(np.ceil(np.log10(p)))}" if p > 1e-300 else "< 1e-300"
+    return f"< {number(10.0 ** int(np.ceil(np.log10(p))))}" if p > 1e-300 else f"< {number(1e-300)}"

@@ -11,7 +11,19 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
 from .figures import set_scale
-from .style import SMALL, TEXT, Theme, dress, foot, head, new_figure, series_style
+from .style import (
+    SMALL,
+    TEXT,
+    Theme,
+    dress,
+    foot,
+    head,
+    method_styles,
+    name_ticks,
+    new_figure,
+    series_style,
+)
+from .text import counted, number
 
 if TYPE_CHECKING:
     from .label_bias import LabelBiasStudy
@@ -51,7 +63,7 @@ def draw_world(study: LabelBiasStudy, theme: Theme) -> Figure:
         reward = float(study.trajectories.reward[path])
         handles.append(
             Line2D([], [], color=style["color"], linestyle=style["linestyle"], marker=style["marker"],
-                   label=f"earns {reward:g}, BIRL {float(study.trajectories.birl[path]):.1f} nats")
+                   label=f"earns {number(reward)}, BIRL {float(study.trajectories.birl[path]):.1f} nats")
         )  # fmt: skip
     dress(axes, theme, x="column (cells)", y="row (cells)", grid=None)
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), aspect="equal")
@@ -72,27 +84,30 @@ def draw_scatter(study: LabelBiasStudy, theme: Theme) -> Figure:
     reward = np.asarray(study.trajectories.reward)
     # Rewards are whole numbers: spread a little, so that trajectories on one spot can be counted.
     spread = np.random.default_rng(0).uniform(-0.12, 0.12, len(reward))
-    for i, (axes, name, likelihood, found) in enumerate(
-        zip(
-            figure.subplots(1, 2),
-            ("BIRL", "MaxEnt"),
-            (study.trajectories.birl, study.trajectories.maxent),
-            (study.birl, study.maxent),
-            strict=True,
-        )
+    for axes, name, likelihood, found in zip(
+        figure.subplots(1, 2),
+        ("BIRL", "MaxEnt"),
+        (study.trajectories.birl, study.trajectories.maxent),
+        (study.birl, study.maxent),
+        strict=True,
     ):
-        style = series_style(theme, 1 - i)
+        style = method_styles(theme, [name])[name]
         axes.plot(
             reward + (spread if name == "BIRL" else 0), np.asarray(likelihood), linestyle="", markersize=5,
             marker=style["marker"], color=style["color"], alpha=0.6,
         )  # fmt: skip
         p = tell_p(found.p)
-        title = f"{name}: rho = {found.rho:.3f}, p {p if p.startswith('<') else f'= {p}'}"
+        title = (
+            f"{name}: no correlation, one of the two is constant"
+            if np.isnan(found.rho)
+            else f"{name}: rho = {found.rho:.3f}, p {p if p.startswith('<') else f'= {p}'}"
+        )
         dress(axes, theme, title=title, x="total reward (steps at an object)", y="log-likelihood (nats)")
     foot(
         figure,
         theme,
-        f"{study.birl.n} trajectories; rewards are whole numbers, on the left shown a little spread",
+        f"{counted(study.birl.n, 'trajectory')}; rewards are whole numbers, on the left shown a little spread"
+        "",
     )
     return figure
 
@@ -114,28 +129,43 @@ def draw_settings(study: LabelBiasStudy, theme: Theme) -> Figure:
     limit = _critical(study.per_world)
     band = axes.axvspan(-limit, limit, color=theme.view, zorder=0, label="not significant at 0.05")
     scatter = np.random.default_rng(0)
-    birl, maxent = series_style(theme, 1), series_style(theme, 0)
+    birl, maxent = method_styles(theme, ["BIRL", "MaxEnt"]).values()
     for i, result in enumerate(study.results):
         known = result.birl[np.isfinite(result.birl)]
         height = i + scatter.uniform(-0.22, 0.22, len(known))
-        axes.plot(known, height, linestyle="", marker="o", markersize=3.2, color=birl["color"], alpha=0.45)
+        axes.plot(
+            known,
+            height,
+            linestyle="",
+            marker=birl["marker"],
+            markersize=3.2,
+            color=birl["color"],
+            alpha=0.45,
+        )
         if len(known):
             axes.plot(np.median(known), i, marker="|", markersize=17, markeredgewidth=2.4, color=theme.ink)
         perfect = result.maxent[np.isfinite(result.maxent)]
         axes.plot(
-            perfect, np.full(len(perfect), i), linestyle="", marker="^", markersize=7, color=maxent["color"]
+            perfect,
+            np.full(len(perfect), i),
+            linestyle="",
+            marker=maxent["marker"],
+            markersize=7,
+            color=maxent["color"],
         )
     printed = axes.axvline(
         PRINTED_RHO, color=theme.ink, linewidth=1.2, linestyle=(0, (1, 1.5)), label="dissertation, BIRL"
     )
     dress(axes, theme, x="correlation of log-likelihood and total reward", grid="x")
-    axes.set_yticks(range(len(study.results)), [r.setting.name for r in study.results], fontsize=SMALL)
+    name_ticks(axes, "y", range(len(study.results)), [r.setting.name for r in study.results], fontsize=SMALL)
     axes.set(ylim=(len(study.results) - 0.5, -0.5), xlim=(-1.05, 1.05))
     handles = [
-        Line2D([], [], linestyle="", marker="o", markersize=4, color=birl["color"], label="BIRL, a world"),
+        Line2D([], [], linestyle="", marker=birl["marker"], markersize=4, color=birl["color"],
+               label="BIRL, a world"),
         Line2D([], [], linestyle="", marker="|", markersize=12, markeredgewidth=2.4, color=theme.ink,
                label="BIRL, median"),
-        Line2D([], [], linestyle="", marker="^", color=maxent["color"], label="MaxEnt, all worlds"),
+        Line2D([], [], linestyle="", marker=maxent["marker"], color=maxent["color"],
+               label="MaxEnt, all worlds"),
         band,
         printed,
     ]  # fmt: skip
@@ -154,12 +184,13 @@ def draw_sweep(study: LabelBiasStudy, theme: Theme) -> Figure:
         axes.axhspan(-limit, limit, color=theme.view, zorder=0, label="not significant at 0.05")
     ]
     names = {True: "BIRL, blocked moves stay put", False: "BIRL, only open moves are actions"}
-    for i, (blocked, results) in enumerate(study.sweep.items(), start=1):
-        style = series_style(theme, i)
+    styles = method_styles(theme, [*names.values(), "MaxEnt"])
+    for blocked, results in study.sweep.items():
+        style = styles[names[blocked]]
         low, median, high = np.array([quantiles(result.birl) for result in results]).T
         axes.fill_between(study.etas, low, high, color=style["color"], alpha=0.2, linewidth=0)
         handles += axes.plot(study.etas, median, label=names[blocked], markersize=5, **style)
-    handles.append(axes.axhline(1.0, color=series_style(theme, 0)["color"], linewidth=2, label="MaxEnt"))
+    handles.append(axes.axhline(1.0, color=styles["MaxEnt"]["color"], linewidth=2, label="MaxEnt"))
     handles.append(
         axes.axhline(
             PRINTED_RHO, color=theme.ink, linewidth=1.2, linestyle=(0, (1, 1.5)), label="dissertation, BIRL"
@@ -174,6 +205,6 @@ def draw_sweep(study: LabelBiasStudy, theme: Theme) -> Figure:
     set_scale(axes, "x", "log")
     axes.set_ylim(-1.05, 1.08)
     head(figure, theme, handles, title="Experts that follow the law they are scored with", columns=2)
-    foot(figure, theme, f"line: median; band: 90% of {study.worlds} worlds")
+    foot(figure, theme, f"line: median; band: 90% of {counted(study.worlds, 'world')}")
     axes.xaxis.label.set_fontsize(TEXT)
     return figure

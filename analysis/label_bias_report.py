@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -22,8 +21,10 @@ from .label_bias import (
     significance,
     tell_p,
 )
-from .report import Picture, Section, Table, write_report
-from .style import save_themes
+from .page import Lead, Section, Table, drawn, write_page
+from .page import print_tables as print_page_tables
+from .results import plain, study_provenance
+from .text import counted, number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -50,17 +51,8 @@ def _rows(study: LabelBiasStudy) -> list[dict[str, Any]]:
 
 def summary(study: LabelBiasStudy) -> dict[str, Any]:
     """Settings and results as plain data; None where no world has a correlation."""
-    told: dict[str, Any] = _without_nan(_summary(study))
+    told: dict[str, Any] = plain({"provenance": study_provenance(study.seed), **_summary(study)})
     return told
-
-
-def _without_nan(told: Any) -> Any:
-    """The same with None for NaN, which JSON does not know."""
-    if isinstance(told, dict):
-        return {name: _without_nan(value) for name, value in told.items()}
-    if isinstance(told, list):
-        return [_without_nan(value) for value in told]
-    return None if isinstance(told, float) and np.isnan(told) else told
 
 
 def _summary(study: LabelBiasStudy) -> dict[str, Any]:
@@ -101,7 +93,7 @@ def _tables(study: LabelBiasStudy) -> tuple[Table, ...]:
             ("dissertation, MaxEnt", "1.0", "not given", "0.0", "75"),
         ],
         f"Log-likelihood and total reward in the median world of {study.results[0].setting.name}; MaxEnt's "
-        f"rho is within {max(abs(1 - study.maxent.rho), np.finfo(float).eps):.0e} of one. "
+        f"rho is within {number(max(abs(1 - study.maxent.rho), np.finfo(float).eps), 1)} of one. "
         f"A correlation of {PRINTED_RHO} of 75 pairs has p = {significance(PRINTED_RHO, 75):.3f}; the p "
         f"printed would go with some 37 pairs (p = {significance(PRINTED_RHO, 37):.3f}).",
     )
@@ -111,7 +103,7 @@ def _tables(study: LabelBiasStudy) -> tuple[Table, ...]:
             *_told_of_birl(result),
             f"{100 * result.negative.value:.0f} %",
             f"{row['median rho of choices met']:+.2f}",
-            f"{row['MaxEnt largest |1 - rho|']:.0e}",
+            number(row["MaxEnt largest |1 - rho|"], 1),
         )
         for row, result in zip(_rows(study), study.results, strict=True)
     ]
@@ -131,10 +123,10 @@ def _tables(study: LabelBiasStudy) -> tuple[Table, ...]:
                 "MaxEnt, |1 - rho|",
             ),
             settings,
-            f"{study.worlds} worlds, {study.per_world} trajectories each; where a correlation is by chance "
-            "only, 5 % of the worlds have p < 0.05. In brackets after a share: its 95 % interval. Choices "
-            "met: median correlation of the total reward and the nats BIRL takes off for choices. MaxEnt: "
-            "the largest deviation in any world.",
+            f"{counted(study.worlds, 'world')}, {counted(study.per_world, 'trajectory')} each; where a "
+            "correlation is by chance only, 5 % of the worlds have p < 0.05. In brackets after a share: its "
+            "95 % interval. Choices met: median correlation of the total reward and the nats BIRL takes off "
+            "for choices. MaxEnt: the largest deviation in any world.",
         ),
         Table(
             ("eta", "rho, blocked moves stay", "p < 0.05", "rho, only open moves", "p < 0.05"),
@@ -155,9 +147,9 @@ def _told_of_birl(result: SettingResult) -> tuple[str, str]:
 
 def _text(study: LabelBiasStudy) -> str:
     first = study.results[0]
-    return f"""A world of 10 x 10 cells with {study.walls} walls, a desirable object in each of two corners, \
-deterministic moves. The law of maximum entropy makes a trajectory's log-likelihood its reward less a \
-constant, so the two correlate perfectly, whoever demonstrates.
+    return f"""A world of 10 x 10 cells with {counted(study.walls, "wall")}, a desirable object in each of \
+two corners, deterministic moves. The law of maximum entropy makes a trajectory's log-likelihood its reward \
+less a constant, so the two correlate perfectly, whoever demonstrates.
 
 Bayesian IRL normalises over actions in every state. Its log-likelihood is the sum of advantages times eta, \
 which grows with the reward, less what the choices met on the way cost, and at an object in a corner there \
@@ -205,22 +197,34 @@ def _eta_of(result: SettingResult) -> str:
 
 def print_tables(study: LabelBiasStudy, console: Console) -> None:
     """Print Table 5.1 as reproduced, and what other settings give."""
-    from rich.table import Table as RichTable
+    print_page_tables(_tables(study), console)
 
-    for part in _tables(study):
-        table = RichTable(caption=part.caption, caption_justify="left")
-        for i, heading in enumerate(part.headings):
-            table.add_column(heading, justify="left" if i == 0 else "right")
-        for row in part.rows:
-            table.add_row(*map(str, row))
-        console.print(table)
+
+def _lead(study: LabelBiasStudy) -> Lead:
+    first = study.results[0]
+    low, median, high = quantiles(first.birl)
+    learned = (
+        f"In {counted(study.worlds, 'world')} of known reward, the log-likelihood of MaxEnt correlates "
+        "perfectly with the reward that a trajectory earns, and that of BIRL "
+        + (
+            "with nothing, since all trajectories earn the same."
+            if np.isnan(median)
+            else f"with rho {median:+.2f} (90 % of worlds: {low:+.2f} to {high:+.2f}) in the first setting."
+        )
+    )
+    share, least, most = first.significant
+    trust = (
+        "Trust the first as a theorem, and the second for its setting only: BIRL's correlation is "
+        f"significant in {100 * share:.0f} % of these worlds ({100 * least:.0f} to {100 * most:.0f}; by "
+        "chance 5), and other settings below give it any value."
+    )
+    return Lead(learned, trust, _tables(study)[:1])
 
 
 def write(study: LabelBiasStudy, folder: Path | str) -> Path:
-    """Write the report: ``index.html``, the pictures in both themes, and ``results.json``."""
-    folder = Path(folder)
+    """Write the page: ``index.html``, the pictures in both themes, and ``results.json``."""
     pictures = [
-        Picture(*save_themes(partial(draw, study), folder, name), caption, description)
+        drawn(folder, name, partial(draw, study), caption, description)
         for name, draw, caption, description in (
             ("world", figures.draw_world,
              "The median world: walls, the two objects, and trajectories from the least reward to the most.",
@@ -236,6 +240,5 @@ def write(study: LabelBiasStudy, folder: Path | str) -> Path:
              "BIRL's correlation falls from positive to minus one with eta where blocked moves stay"),
         )
     ]  # fmt: skip
-    (folder / "results.json").write_text(json.dumps(summary(study), indent=2) + "\n")
-    section = Section("Label bias (Table 5.1)", _text(study), _tables(study), pictures)
-    return write_report(folder, [section], title="Label bias")
+    section = Section("What the correlation depends on", _text(study), _tables(study)[1:], pictures)
+    return write_page(folder, "Label bias (Table 5.1)", _lead(study), [section], summary(study))

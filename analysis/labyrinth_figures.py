@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.cm import ScalarMappable
-from matplotlib.colors import Normalize
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
@@ -18,18 +17,31 @@ from ..domains.labyrinth import (
     BACK,
     FROM_ABOVE,
     HOME,
-    LEVELS,
     N_NODES,
     WATER_PORT,
     Labyrinth,
-    level_of,
     parent_of,
 )
+from ..domains.pictures import maze_layout
 from ..models.planning import action_values, reward_of
-from .labyrinth import BY_LEVEL, LEARNER, UNIFORM, LabyrinthStudy
-from .style import LIGHT, SMALL, TEXT, TITLE, Theme, dress, foot, new_figure
+from .labyrinth import LEARNER, LabyrinthStudy
+from .style import (
+    LIGHT,
+    SMALL,
+    TEXT,
+    TITLE,
+    Theme,
+    dress,
+    dress_bar,
+    foot,
+    headline,
+    method_styles,
+    new_figure,
+)
+from .text import for_figure
 
-_CORRIDOR, _WALL = 0.72, 0.14
+# In the units of the maze's layout, whose ends are four apart.
+_CORRIDOR, _WALL = 1.44, 0.28
 
 
 def bits_by_bout(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
@@ -38,7 +50,7 @@ def bits_by_bout(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
     panels = figure.subplots(1, len(result.views), squeeze=False, sharey=True)[0]
     bouts = np.arange(1, len(result.decisions) + 1)
     seen = np.cumsum(result.decisions)
-    styles = _method_styles(theme)
+    styles = _method_styles(theme, result)
     for axes, view in zip(panels, result.views, strict=True):
         running = {p.method: np.cumsum(p.bits) / seen for p in view.predictions}
         for method, line in running.items():
@@ -54,27 +66,28 @@ def bits_by_bout(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
         ends = np.array([p.bits.sum() / seen[-1] for p in order])
         for p, end, y in zip(order, ends, _spread(ends, 0.052 * (high - low)), strict=True):
             axes.annotate(
-                f"{p.method}  {end:.3f}", (bouts[-1], y), (6, 0), textcoords="offset points", va="center",
-                color=styles[p.method]["color"], fontsize=SMALL, annotation_clip=False,
-                fontweight="bold" if p.method == LEARNER else "normal",
+                for_figure(f"{p.method}  {end:.3f}"), (bouts[-1], end), (1.04, y),
+                textcoords=("axes fraction", "data"), va="center", color=theme.ink, fontsize=SMALL,
+                annotation_clip=False, fontweight="bold" if p.method == LEARNER else "normal",
+                arrowprops={
+                    "arrowstyle": "-", "shrinkA": 0, "shrinkB": 1, "relpos": (0, 0.5),
+                    "color": styles[p.method]["color"], "linestyle": styles[p.method]["linestyle"],
+                },
             )  # fmt: skip
-    figure.suptitle(result.recording, color=theme.ink, fontsize=TITLE + 0.5, x=0.01, ha="left")
+    headline(figure, theme, result.recording)
     foot(figure, theme, "each bout predicted before it is learned from")
     return figure
 
 
-def _method_styles(theme: Theme) -> dict[str, dict[str, Any]]:
-    red, blue, green = theme.series[1], theme.series[0], theme.series[2]
-    return {
-        LEARNER: {"color": red, "linewidth": 2.6, "zorder": 3},
-        BY_LEVEL: {"color": red, "linewidth": 1.4, "linestyle": (0, (5, 2))},
-        UNIFORM: {"color": theme.muted, "linewidth": 1.4, "linestyle": (0, (1.5, 1.5))},
-        "frequencies": {"color": theme.series[4], "linewidth": 1.4},
-        "frequencies of choices": {"color": theme.series[4], "linewidth": 1.4, "linestyle": (0, (5, 2))},
-        "given entry": {"color": theme.series[3], "linewidth": 1.4},
-        "level and entry": {"color": green, "linewidth": 1.4},
-        "Markov": {"color": blue, "linewidth": 1.8},
+def _method_styles(theme: Theme, result: LabyrinthStudy) -> dict[str, dict[str, Any]]:
+    """Looks of the methods without their markers, the learner's line above and wider than the others."""
+    names = [p.method for view in result.views for p in view.predictions]
+    styles = {
+        name: {**style, "marker": None, "linewidth": 1.4}
+        for name, style in method_styles(theme, names).items()
     }
+    styles[LEARNER] |= {"linewidth": 2.8, "zorder": 3}
+    return styles
 
 
 def _spread(heights: Float[np.ndarray, " m"], gap: float) -> Float[np.ndarray, " m"]:
@@ -97,15 +110,14 @@ def value_on_maze(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
     by_node = [
         values_by_node(result.maze, view.learned.weights, view.learned.values) for view in result.views
     ]
-    shades = ScalarMappable(Normalize(np.nanmin(by_node), np.nanmax(by_node)), theme.colormap)
+    shades = theme.signed_shades(np.array(by_node))
     for axes, view, values in zip(panels, result.views, by_node, strict=True):
         draw_maze(axes, values, shades, np.unique(result.maze.node[view.hidden]), theme)
         axes.set_title(view.view, color=theme.ink, fontsize=TITLE, loc="left")
     bar = figure.colorbar(shades, ax=list(panels), shrink=0.75, aspect=30, pad=0.01)
-    bar.set_label("learned value of stepping in from above (nats)", color=theme.ink, fontsize=TEXT)
-    bar.ax.tick_params(colors=theme.muted, labelcolor=theme.ink, labelsize=SMALL)
-    bar.outline.set_edgecolor(theme.muted)
-    figure.suptitle(result.recording, color=theme.ink, fontsize=TITLE + 0.5, x=0.01, ha="left")
+    dress_bar(bar, theme, "learned value of stepping in from above (nats)")
+    bar.ax.axhline(0.0, color=theme.ink, linewidth=1.6)
+    headline(figure, theme, result.recording)
     return figure
 
 
@@ -125,23 +137,6 @@ def values_by_node(
     return by_node
 
 
-def maze_layout() -> Float[np.ndarray, "128 2"]:
-    """Position of every node, home last: an H-tree entered from the left, left children on the left hand.
-
-    Ends lie on a square grid with spacing 2; corridors halve in length at every second level.
-    """
-    position = np.zeros((N_NODES + 1, 2))
-    heading = np.zeros((N_NODES, 2))
-    heading[0] = (1.0, 0.0)
-    for node in range(1, N_NODES):
-        parent = parent_of(node)
-        x, y = heading[parent]
-        heading[node] = (-y, x) if node == 2 * parent + 1 else (y, -x)
-        position[node] = position[parent] + heading[node] * 2.0 ** ((LEVELS - level_of(node)) // 2)
-    position[HOME] = (-9.0, 0.0)
-    return position
-
-
 def draw_maze(
     axes: Axes,
     values: Float[np.ndarray, " 127"],
@@ -149,7 +144,10 @@ def draw_maze(
     hidden: Int[np.ndarray, " h"],
     theme: Theme = LIGHT,
 ) -> None:
-    """Draw corridors coloured by the value of the node they lead to (none: NaN); hidden ones are hatched."""
+    """Draw corridors coloured by the value of the node they lead to (none: NaN); hidden ones are hatched.
+
+    The maze lies as its environment draws it (:func:`i2rl.domains.pictures.maze_layout`).
+    """
     position = maze_layout()
 
     def corridor(node: int, width: float, colour: Any) -> None:
@@ -165,21 +163,18 @@ def draw_maze(
     for node in reversed(range(N_NODES)):
         corridor(node, _CORRIDOR, theme.cell if np.isnan(values[node]) else shades.to_rgba(values[node]))
     if len(hidden):
-        low, high = position[hidden].min(0) - 0.5, position[hidden].max(0) + 0.5
+        low, high = position[hidden].min(0) - 1.0, position[hidden].max(0) + 1.0
         style: dict[str, Any] = {"edgecolor": theme.muted, "linewidth": 0.0, "hatch": "//"}
         axes.add_patch(Rectangle(tuple(low), *(high - low), facecolor=theme.surface, alpha=0.45, **style))
-        axes.text((low[0] + high[0]) / 2, high[1] + 0.2, "out of view", ha="center", va="bottom",
+        axes.text((low[0] + high[0]) / 2, high[1] + 0.4, "out of view", ha="center", va="bottom",
                   color=theme.ink, fontsize=TEXT)  # fmt: skip
     port, home = position[WATER_PORT], position[HOME]
     axes.plot(*port, "o", markersize=8, markerfacecolor=theme.goal, markeredgecolor=theme.surface)
-    outward = np.sign(port[0])
-    axes.annotate(
-        "water", port, (port[0] + 1.1 * outward, port[1]), color=theme.ink, fontsize=TEXT, va="center",
-        ha="left" if outward > 0 else "right",
-    )  # fmt: skip
     axes.plot(*home, "s", markersize=9, markerfacecolor=theme.surface, markeredgecolor=theme.ink)
-    axes.annotate(
-        "home", home, (0, 11), textcoords="offset points", ha="center", color=theme.ink, fontsize=TEXT
-    )
-    axes.set(xlim=(-9.9, 8.2), ylim=(-8.3, 9.0), aspect="equal")
+    for place, name in ((port, "water"), (home, "home")):
+        axes.annotate(
+            name, place, (0, -12), textcoords="offset points", ha="center", va="top", color=theme.ink,
+            fontsize=TEXT,
+        )  # fmt: skip
+    axes.set(xlim=(-16, 16), ylim=(-19, 17), aspect="equal")
     axes.axis("off")

@@ -19,7 +19,7 @@ from matplotlib.ticker import MaxNLocator
 from ..domains.patrol import FORWARD, LEFT, RIGHT, SECONDS_PER_STEP, STOP, Cell, Patrol, break_ties
 from ..models.planning import greedy_actions
 from .metrics import optimal_actions
-from .style import LIGHT, SMALL, TEXT, Theme, dress, new_figure
+from .style import LIGHT, SMALL, TEXT, Theme, dress, dress_bar, headline, new_figure
 
 _INCHES_PER_CELL = 0.46
 
@@ -72,10 +72,7 @@ def policy_map(
     _draw_key(legend, theme, patrol.breach is not None, view is not None)
     seen = "" if observability is None else f", {observability} % observability"
     share = f"{agrees.sum()} of {len(agrees)} states as the expert ({100 * agrees.mean():.1f} %)"
-    figure.suptitle(
-        f"{title}: {share}\n{patrol.name}{seen}",
-        color=theme.ink, fontsize=TEXT + 1.5, x=0.01, ha="left",
-    )  # fmt: skip
+    headline(figure, theme, f"{title}: {share}\n{patrol.name}{seen}", TEXT + 1.5)
     return figure
 
 
@@ -138,17 +135,12 @@ def _draw_mark(axes: Axes, theme: Theme, row: float, column: float, letter: str)
             zorder=5,
         )
     )
+    # In a corner, which glyphs leave free: those of a cell stand at the middles of its sides.
     axes.text(
-        column,
-        row,
-        letter,
-        ha="center",
-        va="center",
-        color=theme.goal,
-        fontweight="bold",
-        fontsize=7.5,
-        zorder=6,
-    )
+        column - 0.29, row - 0.29, letter, ha="center", va="center_baseline", color=theme.goal,
+        fontweight="bold", fontsize=7.5, zorder=6,
+        bbox={"boxstyle": "square,pad=0.08", "facecolor": theme.surface, "edgecolor": "none", "alpha": 0.85},
+    )  # fmt: skip
 
 
 def _draw_floor(
@@ -291,10 +283,8 @@ def hidden_path(
             labelcolor=theme.ink,
         )
     bar = figure.colorbar(image, ax=[strip, axes], pad=0.015, fraction=0.04, aspect=35)
-    bar.set_label("probability of the cell", color=theme.ink, fontsize=TEXT)
-    bar.ax.tick_params(colors=theme.muted, labelcolor=theme.ink, labelsize=SMALL)
-    bar.outline.set_edgecolor(theme.muted)
-    figure.suptitle(f"{title} ({patrol.name})", color=theme.ink, fontsize=TEXT + 1.5, x=0.01, ha="left")
+    dress_bar(bar, theme, "probability of the cell")
+    headline(figure, theme, f"{title} ({patrol.name})", TEXT + 1.5)
     return figure
 
 

@@ -6,11 +6,13 @@ like the expert, and what it loses. Everything is exact: no simulation, no offse
 
 from __future__ import annotations
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ..inference.smoothing import evidence_of, log_likelihoods
@@ -98,6 +100,19 @@ def learned_behavior_accuracy(
     is not credited with every action); the expert's ties all count. Source: section 7.2. Errors as there.
     """
     return evaluate(mdp, true_weights, learned_weights).accuracy
+
+
+def chance_accuracy(
+    key: Array, mdp: TabularMDP, true_weights: Float[Array, " K"], draws: int = 200
+) -> Float[np.ndarray, " draws"]:
+    """LBA of weights that nobody learned, drawn uniformly from ``[-0.99, 0.99]^K``.
+
+    An accuracy that many of them reach is no sign that anything was learned. Errors as for
+    :func:`greedy_policy`.
+    """
+    drawn = jax.random.uniform(key, (draws, mdp.n_features), float, -0.99, 0.99)
+    scores = lax.map(partial(evaluate, mdp, jnp.asarray(true_weights)), drawn, batch_size=16)
+    return np.asarray(scores.accuracy.overall)
 
 
 def inverse_learning_error(

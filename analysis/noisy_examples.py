@@ -48,6 +48,8 @@ class SensorPosterior(NamedTuple):
         Share of the reports learned from that agree with what they are of.
     trajectories, divergences : int
         That were learned from; divergent transitions of NUTS.
+    reward : float ``[draws, K]`` or None
+        Weights of the same draws.
     """
 
     names: tuple[str, ...]
@@ -57,6 +59,7 @@ class SensorPosterior(NamedTuple):
     happened: Float[np.ndarray, " J"]
     trajectories: int
     divergences: int
+    reward: Float[np.ndarray, "draws K"] | None = None
 
 
 def sensor_posterior(
@@ -85,6 +88,7 @@ def sensor_posterior(
         agreement_probabilities(task.noise, task.features, pairs), (reports == pairs_done).mean((1, 2)),
         seen.n_trajectories,
         int(np.asarray(data["sample_stats"]["diverging"]).sum()),
+        np.asarray(data["posterior"]["weights"]).reshape(len(reliabilities), -1),
     )  # fmt: skip
 
 

@@ -37,7 +37,20 @@ from .noisy_study import (
     NoisyStudy,
     mean_interval,
 )
-from .style import SMALL, TEXT, TITLE, Theme, dress, foot, head, new_figure, series_style
+from .style import (
+    SMALL,
+    TEXT,
+    TITLE,
+    Theme,
+    dress,
+    dress_bar,
+    foot,
+    head,
+    method_styles,
+    name_ticks,
+    new_figure,
+)
+from .text import counted
 
 # Pairs with less posterior mass at every step are left out of a strip.
 RARE_PAIR = 0.1
@@ -46,16 +59,15 @@ RARE_PAIR = 0.1
 def _draw_mean(
     axes: Axes,
     theme: Theme,
-    i: int,
     result: MethodResult,
     runs: Float[np.ndarray, "runs T"],
     top: float = np.inf,
 ) -> None:
-    """The ``i``-th method's mean and its band, which ends at ``top`` and at a fifth of the mean.
+    """Draw a method's mean and its band, which ends at ``top`` and at a fifth of the mean.
 
     The normal interval knows nothing of either end of a scale; a logarithmic one has no zero.
     """
-    style, band = series_style(theme, i), mean_interval(runs)
+    style, band = method_styles(theme, [result.name])[result.name], mean_interval(runs)
     x = result.sessions
     if len(runs) > 1:
         low, high = np.maximum(band.low, band.mean / 5), np.minimum(band.high, top)
@@ -79,6 +91,15 @@ def _legend_above(panel: Axes, theme: Theme, title: str) -> None:
     legend.get_title().set_color(theme.ink)
 
 
+def _mean_of(runs: int, interval: str = "band") -> str:
+    """Small print of a figure of means."""
+    return (
+        "line: one run"
+        if runs == 1
+        else f"line: mean of {counted(runs, 'run')}; {interval}: its 95% interval"
+    )
+
+
 def _count_sessions(panel: Axes, sessions: int) -> None:
     ticks = MaxNLocator(8, steps=[1, 2, 5, 10], integer=True).tick_values(1, sessions)
     panel.set_xticks([int(t) for t in ticks if 1 <= t <= sessions])
@@ -94,10 +115,10 @@ def divergence_plot(study: NoisyStudy, theme: Theme) -> Figure:
     panels = _panels(figure, 2)
     for panel, (title, names) in zip(panels, groups, strict=True):
         shown = [name for name in names if name in study.results]
-        for i, name in enumerate(shown):
+        for name in shown:
             result = study.results[name]
             assert result.divergence is not None
-            _draw_mean(panel, theme, i, result, result.divergence)
+            _draw_mean(panel, theme, result, result.divergence)
         panel.axhline(
             study.control, color=theme.ink, linewidth=1.3, linestyle=(0, (1, 1.5)), label="constant one half"
         )
@@ -117,7 +138,7 @@ def divergence_plot(study: NoisyStudy, theme: Theme) -> Figure:
         "divergence of agreement probabilities\n(nats, mean over predicates)", color=theme.ink
     )
     head(figure, theme, [], title=f"What is learned of perception, {study.task.name}")
-    foot(figure, theme, f"line: mean of {study.runs} runs; band: its 95% interval")
+    foot(figure, theme, _mean_of(study.runs))
     return figure
 
 
@@ -133,24 +154,23 @@ def accuracy_plot(study: NoisyStudy, theme: Theme) -> Figure:
     panels = _panels(figure, n)
     lowest = 1.0
     for which, (panel, title) in enumerate(zip(panels, titles, strict=False)):
-        for i, name in enumerate(names):
+        for name in names:
             values = study.results[name].accuracy[..., which]
-            _draw_mean(panel, theme, i, study.results[name], values, 1.0)
+            _draw_mean(panel, theme, study.results[name], values, 1.0)
             lowest = min(lowest, float(np.nanmin([mean_interval(values).low, values.mean(0)])))
-        for name, marker, shift in ((ROBUST, "*", 0.6), (MLIRL, "X", 1.2)):
+        for name, shift in ((ROBUST, 0.6), (MLIRL, 1.2)):
             if name in study.results:
+                style = method_styles(theme, [name])[name]
                 band = mean_interval(study.results[name].accuracy[:, -1, which])
                 x = study.sessions + shift
-                panel.vlines(x, band.low, min(float(band.high), 1.0), color=theme.ink, linewidth=1.2)
-                panel.plot(
-                    x, band.mean, linestyle="", marker=marker, markersize=8, color=theme.ink, label=name
-                )
+                panel.vlines(x, band.low, min(float(band.high), 1.0), color=style["color"], linewidth=1.2)
+                panel.plot(x, band.mean, markersize=8, label=name, **{**style, "linestyle": ""})
                 lowest = min(lowest, float(band.mean))
         dress(panel, theme, title=title, x="session")
     if study.hidden is not None:
-        for i, name in enumerate((HIDDEN, BOTH)):
+        for name in (HIDDEN, BOTH):
             values = study.hidden[name].accuracy[..., 0]
-            _draw_mean(panels[-1], theme, 1 - i, study.hidden[name], values, 1.0)
+            _draw_mean(panels[-1], theme, study.hidden[name], values, 1.0)
             lowest = min(lowest, float(np.nanmin([mean_interval(values).low, values.mean(0)])))
         dress(panels[-1], theme, title=f"{OBSERVABILITY} % in view", x="session")
         # Other lines than those of the first panel, in some of its colours.
@@ -165,8 +185,8 @@ def accuracy_plot(study: NoisyStudy, theme: Theme) -> Figure:
         figure, theme, panels[0].get_legend_handles_labels()[0], title=f"Behaviour learned, {study.task.name}"
     )
     few = {len(study.results[m].weights) for m in (ROBUST, MLIRL) if m in study.results}
-    batch = f"; batch: all sessions at once, {few.pop()} runs" if few else ""
-    foot(figure, theme, f"line: mean of {study.runs} runs; band and bar: its 95% interval{batch}")
+    batch = f"; batch: all sessions at once, {counted(few.pop(), 'run')}" if few else ""
+    foot(figure, theme, _mean_of(study.runs, "band and bar") + batch)
     return figure
 
 
@@ -192,7 +212,7 @@ def sensor_plot(posterior: SensorPosterior, theme: Theme) -> Figure:
         color=theme.ink, clip_on=False,
     )  # fmt: skip
     dress(axes, theme, x="probability that a report agrees with the truth", grid="x")
-    axes.set_yticks(y, list(posterior.names), fontsize=TEXT)
+    name_ticks(axes, "y", y, posterior.names, fontsize=TEXT)
     axes.set_ylim(n - 0.4, -0.6)
     least = np.min([band.low, posterior.truth, posterior.learned, posterior.happened])
     axes.set_xlim(max(least - 0.03, 0.0), 1.0)
@@ -207,7 +227,7 @@ def sensor_plot(posterior: SensorPosterior, theme: Theme) -> Figure:
                label="share of these reports"),
     ]  # fmt: skip
     head(figure, theme, handles, title="How reliable each feature is thought to be", columns=2)
-    foot(figure, theme, f"learned from {posterior.trajectories} trajectories without scores")
+    foot(figure, theme, f"learned from {counted(posterior.trajectories, 'trajectory')} without scores")
     return figure
 
 
@@ -240,15 +260,13 @@ def strip_plot(strip: Strip, mdp: TabularMDP, theme: Theme) -> Figure:
     axes.plot(steps, [row[int(g)] for g in true], **true_style)
     dress(axes, theme, x="step", grid=None)
     axes.set_xticks(steps, [str(t + 1) for t in steps])
-    axes.set_yticks(range(len(shown)), _pair_names(mdp, shown), fontsize=SMALL)
+    name_ticks(axes, "y", range(len(shown)), _pair_names(mdp, shown), fontsize=SMALL)
     for edge in np.arange(len(shown) - 1) + 0.5:
         axes.axhline(edge, color=theme.grid, linewidth=0.6)
     for edge in steps[:-1] + 0.5:
         axes.axvline(edge, color=theme.grid, linewidth=0.6)
     bar = figure.colorbar(picture, ax=axes, pad=0.01, fraction=0.03)
-    bar.set_label("posterior probability", color=theme.ink, fontsize=TEXT)
-    bar.ax.tick_params(colors=theme.muted, labelcolor=theme.ink, labelsize=SMALL)
-    bar.outline.set_visible(False)
+    dress_bar(bar, theme, "posterior probability")
     handles: list[Artist] = [
         Line2D([], [], label="seen", **seen_style), Line2D([], [], label="happened", **true_style)
     ]  # fmt: skip
@@ -257,7 +275,7 @@ def strip_plot(strip: Strip, mdp: TabularMDP, theme: Theme) -> Figure:
         figure,
         theme,
         handles,
-        title=f"What is believed of one trajectory ({wrong} of {length} reports wrong)",
+        title=f"What is believed of one trajectory ({wrong} of {counted(length, 'report')} wrong)",
     )
     return figure
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import math
 from functools import partial
 from pathlib import Path
@@ -12,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from . import noisy_figures as figures
+from .metrics import quantile_band
 from .noisy_examples import HEADINGS, belt_cells
 from .noisy_study import (
     AVERAGED,
@@ -31,11 +31,15 @@ from .noisy_study import (
     NoisyStudy,
     mean_interval,
 )
-from .report import Picture, Section, Table, write_report
-from .sorting_table import caption, sorting_table_plot, sorting_table_summary
-from .style import save_themes
+from .page import Lead, Section, Table, drawn, write_page
+from .page import print_tables as print_page_tables
+from .results import plain, study_provenance
+from .sorting_table import SortingTable, caption, sorting_table_plot, sorting_table_summary
+from .style import Theme
+from .text import counted, number
 
 if TYPE_CHECKING:
+    from matplotlib.figure import Figure
     from rich.console import Console
 
 LATE = 20
@@ -45,7 +49,8 @@ TARGETS = {PLAIN: (1 / 6, 1 / 12), AVERAGED: (1 / 12, 1 / 24), STEPWISE: (1 / 12
 
 def summary(study: NoisyStudy) -> dict[str, Any]:
     """Settings and all measures as plain data."""
-    return {
+    told: dict[str, Any] = plain({
+        "provenance": study_provenance(study.seed),
         "task": study.task.name,
         "starts": study.starts,
         "runs": study.runs,
@@ -59,6 +64,7 @@ def summary(study: NoisyStudy) -> dict[str, Any]:
             {
                 "method": name,
                 "runs": len(result.weights),
+                "weights": result.weights[:, -1],
                 "sessions": result.sessions.tolist(),
                 "divergence": _described(result.divergence if _quotable(study, name) else None),
                 "accuracy": {states: _described(result.accuracy[..., i]) for i, states in enumerate(STATES)},
@@ -81,8 +87,36 @@ def summary(study: NoisyStudy) -> dict[str, Any]:
             "in these reports": study.posterior.happened.tolist(),
             "divergent transitions": study.posterior.divergences,
         },
+        "features": list(study.task.mdp.feature_names),
+        "true weights": study.task.weights,
+        "reward, first run": None if (found := _reward(study)) is None else found,
+        "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
         "belts": None if study.belts is None else sorting_table_summary(study.belts),
-    }
+    })  # fmt: skip
+    return told
+
+
+def _reward(study: NoisyStudy) -> list[dict[str, Any]] | None:
+    """Weights of the first run, learned and drawn from the posterior of its early sessions."""
+    if study.posterior is None or study.posterior.reward is None:
+        return None
+    band = quantile_band(study.posterior.reward, 0.95)
+    return [
+        {
+            "feature": name,
+            "learned": float(weight),
+            "posterior median": float(median),
+            "95 % interval": [low, high],
+        }
+        for name, weight, median, low, high in zip(
+            study.task.mdp.feature_names,
+            study.results[PLAIN].weights[0, -1],
+            band.median,
+            band.low,
+            band.high,
+            strict=True,
+        )
+    ]
 
 
 def _described(runs: Float[np.ndarray, "runs T"] | None) -> dict[str, list[float | None]] | None:
@@ -216,7 +250,9 @@ def pace_table(study: NoisyStudy) -> Table:
     return Table(
         ("learner", "milliseconds a session", "over RIFOM"),
         rows,
-        "Median of update once compiled. The dissertation: 96.7 s over 86.0 s to converge, 1.12.",
+        "Median of an update once compiled."
+        # Section 7.3's seconds are of sorting onions.
+        + (" The dissertation: 96.7 s over 86.0 s to converge, 1.12." if study.belts is not None else ""),
     )
 
 
@@ -244,16 +280,7 @@ def _tables(study: NoisyStudy) -> list[Table]:
 
 def print_tables(study: NoisyStudy, console: Console) -> None:
     """Print all tables."""
-    from rich.table import Table as RichTable
-
-    console.print(_title(study), highlight=False)
-    for part in _tables(study):
-        table = RichTable(caption=part.caption, caption_justify="left")
-        for i, heading in enumerate(part.headings):
-            table.add_column(heading, justify="left" if i == 0 else "right")
-        for row in part.rows:
-            table.add_row(*map(str, row))
-        console.print(table)
+    print_page_tables(_tables(study), console, _title(study))
 
 
 # -- the page -----------------------------------------------------------------------------------------
@@ -280,8 +307,9 @@ def _text(study: NoisyStudy) -> str:
         else ""
     )
     return f"""An expert acts optimally; every pair of its trajectories is reported, some of them wrongly. \
-The learner knows neither how often nor which. {study.runs} independent runs have {study.sessions} sessions \
-of {TRAJECTORIES} trajectories of {STEPS} pairs; reports and calibrated scores are the same for every method.
+The learner knows neither how often nor which. There {"is" if study.runs == 1 else "are"} \
+{counted(study.runs, "independent run")} of {counted(study.sessions, "session")} of {TRAJECTORIES} \
+trajectories of {STEPS} pairs; reports and calibrated scores are the same for every method.
 
 {bare}The sensor is judged by agreement probabilities: how often a predicate of a report is that of the \
 truth. The reliabilities that parametrise the sensor are no frequencies. Controls: the constant one half; \
@@ -301,31 +329,65 @@ def _doubts(study: NoisyStudy) -> str:
     return " ".join(lines)
 
 
+def _lead(study: NoisyStudy) -> Lead:
+    result, early = study.results[PLAIN], min(EARLY, study.sessions)
+    final = float(result.accuracy[:, -1, 0].mean())
+    learned = (
+        f"From {counted(study.sessions, 'session')} of {TRAJECTORIES} misreported trajectories each, RIMEO learned "
+        f"a reward whose policy does as the expert in {number(100 * final)} % of the states, and at the same "
+        "time how often perception is right."
+    )
+    reach = float(np.mean(study.chance >= final - 1e-9))
+    chance = (
+        f"{number(100 * reach, 2)} % of random weights reach that accuracy, half of them "
+        f"{number(100 * float(np.median(study.chance)))} %"
+    )
+    runs = "one run shows no spread" if study.runs == 1 else f"a mean of {counted(study.runs, 'run')}"
+    sensor = (
+        "and the sensor, which these reports identify"
+        if _quotable(study, PLAIN)
+        else "but not the sensor, whose errors these reports do not tell from the expert's"
+    )
+    verdict = "Trust the policy" if reach <= 0.05 else "Do not take the accuracy for evidence"
+    trust = f"{verdict} ({chance}; {runs}), {sensor}."
+    rows = [
+        (
+            row["feature"], row["learned"], row["posterior median"],
+            f"{number(row['95 % interval'][0])} to {number(row['95 % interval'][1])}", float(true),
+        )
+        for row, true in zip(_reward(study) or [], study.task.weights, strict=False)
+    ]  # fmt: skip
+    if not rows:
+        return Lead(learned, trust)
+    table = Table(
+        ("feature", f"weight, {PLAIN}", "posterior median", "95 % interval", "true weight"),
+        rows,
+        f"Weights of the first run after its last session, and the posterior (NUTS) of its first "
+        f"{counted(early, 'session')}. A reward is known up to its length.",
+    )
+    return Lead(learned, trust, [table])
+
+
 def write(study: NoisyStudy, folder: Path | str) -> Path:
-    """Write the report: ``index.html``, the pictures in both themes, and ``results.json``."""
-    folder = Path(folder)
-
-    def picture(name: str, draw: Any, told: str, description: str) -> Picture:
-        return Picture(*save_themes(draw, folder, name), told, description)
-
-    divergence = picture(
-        "divergence", partial(figures.divergence_plot, study),
+    """Write the page: ``index.html``, the pictures in both themes, and ``results.json``."""
+    divergence = drawn(
+        folder, "divergence", partial(figures.divergence_plot, study),
         "How far the learned sensor is from the true one (Figures 7.9 and 7.10).",
         "Divergence of agreement probabilities against sessions, logarithmic, RIMEO and controls",
     )  # fmt: skip
-    accuracy = picture(
-        "accuracy", partial(figures.accuracy_plot, study),
+    accuracy = drawn(
+        folder, "accuracy", partial(figures.accuracy_plot, study),
         "Learned behaviour accuracy. The axis does not begin at zero.",
         "Learned behaviour accuracy against sessions for RIMEO, RIFOM and learners that know the sensor",
     )  # fmt: skip
-    strip = picture(
-        "strip", partial(figures.strip_plot, study.strip, study.task.mdp),
-        f"A new trajectory as {PLAIN} of the first run understands it after its last session. Pairs that "
-        "are never likely are left out.",
+    strip = drawn(
+        folder, "strip", partial(figures.strip_plot, study.strip, study.task.mdp),
+        f"A new trajectory as the first run's learner ({PLAIN}) understands it after its last session. Pairs "
+        "that are never likely are left out.",
         "Grid of pairs against steps shaded by posterior probability, with what was seen and what happened",
     )  # fmt: skip
     sections = [
-        Section(_title(study), _text(study), [sensor_table(study)], [divergence]),
+        Section("The sensor", _text(study), [sensor_table(study)], [divergence]),
         Section("The expert's errors, or the sensor's?", _doubts(study), [doubt_table(study)]),
         Section("Behaviour", "", [behaviour_table(study)], [accuracy]),
     ]
@@ -340,8 +402,8 @@ def write(study: NoisyStudy, folder: Path | str) -> Path:
     )
     pictures = [strip]
     if study.posterior is not None:
-        sensor = picture(
-            "sensor", partial(figures.sensor_plot, study.posterior),
+        sensor = drawn(
+            folder, "sensor", partial(figures.sensor_plot, study.posterior),
             "Joint posterior over reward and reliabilities (NUTS), as agreement probabilities, beside "
             "RIMEO's estimate from the same trajectories.",
             "Posterior intervals of each feature's agreement probability with the truth marked",
@@ -349,9 +411,9 @@ def write(study: NoisyStudy, folder: Path | str) -> Path:
         pictures.insert(0, sensor)
     sections.append(Section("What one learner believes", told, [], pictures))
     if study.belts is not None:
-        belts = picture(
-            "belts",
-            lambda theme: sorting_table_plot(study.belts, theme=theme, title="Sorting after learning"),
+        belts = drawn(
+            folder, "belts",
+            partial(_draw_belts, study.belts),
             "What the learned policies do on simulated belts, beside the dissertation's belt (Figure 7.9).",
             "Precision and recall of the expert and of each method, with intervals",
         )  # fmt: skip
@@ -361,5 +423,8 @@ def write(study: NoisyStudy, folder: Path | str) -> Path:
         )
         sections.append(Section("Sorting", text, [belts_table(study)], [belts]))
     sections.append(Section("Time", "", [pace_table(study)]))
-    (folder / "results.json").write_text(json.dumps(summary(study), indent=2) + "\n")
-    return write_report(folder, sections, title="Noisy perception")
+    return write_page(folder, _title(study), _lead(study), sections, summary(study))
+
+
+def _draw_belts(belts: SortingTable, theme: Theme) -> Figure:
+    return sorting_table_plot(belts, theme=theme, title="Sorting after learning")

@@ -36,7 +36,7 @@ from ..models.demonstration import SEEN, Demonstration
 from ..models.evidence import Imperfection, Sensor, Visibility
 from ..models.mdp import TabularMDP
 from ..models.planning import deterministic_policy, hard_plan, reachable_states, reward_of
-from .metrics import optimal_actions
+from .metrics import chance_accuracy, optimal_actions
 from .noisy_examples import BELTS, SensorPosterior, Strip, sensor_posterior, sorted_belts, strip
 from .sorting_table import SortingTable
 
@@ -214,6 +214,8 @@ class NoisyStudy(NamedTuple):
         Another trajectory, as the learner of the first stream understands it in the end.
     belts : SortingTable or None
         Of the sorting task.
+    chance : float ``[draws]``
+        LBA over all states of random weights.
     """
 
     task: NoisyTask
@@ -231,6 +233,7 @@ class NoisyStudy(NamedTuple):
     posterior: SensorPosterior | None
     strip: Strip
     belts: SortingTable | None
+    chance: Float[np.ndarray, " draws"]
 
     @property
     def control(self) -> float:
@@ -460,6 +463,7 @@ def study(
     return NoisyStudy(
         task, starts, runs, sessions, seed, streams, judge.true_agreement, judge.states, results, seconds,
         doubt, hidden, posterior, happened, sorted_,
+        chance_accuracy(jax.random.fold_in(show, 200), task.mdp, jnp.asarray(task.weights)),
     )  # fmt: skip
 
 

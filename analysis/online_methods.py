@@ -5,7 +5,6 @@ The study gives every method the same fully observed patrol and asks how many st
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -24,14 +23,19 @@ from ..inference.darko import darko_i2rl, goal_sessions
 from ..inference.jin import jin_i2rl, jin_i2rl_with_features
 from ..inference.lme import lme_i2rl, lme_i2rl_with_random_weights, me_i2rl
 from ..inference.session import Learner, run_sessions
-from ..models.demonstration import Demonstration
+from ..models.demonstration import SEEN, Demonstration
 from ..models.evidence import Sensor
 from ..models.mdp import TabularMDP
 from ..models.planning import deterministic_policy, hard_plan, reward_of
+from .estimates import Estimates, laplace_errors
 from .figures import draw_band, set_scale
-from .metrics import optimal_actions, policy_accuracy, quantile_band
-from .report import Picture, Section, Table, write_report
-from .style import Theme, dress, foot, head, new_figure, save_themes
+from .information import complete_information
+from .metrics import chance_accuracy, optimal_actions, policy_accuracy, quantile_band
+from .page import Lead, Section, Table, drawn, write_page
+from .page import print_tables as print_page_tables
+from .results import plain, study_provenance
+from .style import Theme, dress, foot, head, method_styles, new_figure
+from .text import counted, number
 
 if TYPE_CHECKING:
     import pandas
@@ -95,18 +99,31 @@ def _described(learner: Learner) -> tuple[str, str, int, str, int]:
 
 
 class MethodCurve(NamedTuple):
-    """One method: ``accuracy [streams, points]``, LBA in [0, 1], and its learning rate (None: has none)."""
+    """One method.
+
+    Fields
+    ------
+    name : str
+    accuracy : float ``[streams, points]``
+        LBA in [0, 1].
+    learning_rate : float or None
+        None: has none.
+    weights : float ``[streams, K]``
+        Learned by the end.
+    """
 
     name: str
     accuracy: Float[np.ndarray, "streams points"]
     learning_rate: float | None
+    weights: Float[np.ndarray, "streams K"]
 
 
 class MethodsStudy(NamedTuple):
     """Settings, the pairs seen at which accuracy was measured, the methods' curves, and the sweeps.
 
     ``sweeps`` holds for each method with a learning rate its score at each of ``rates`` on the tuning
-    demonstrations: the median over streams of the mean accuracy over ``points``.
+    demonstrations: the median over streams of the mean accuracy over ``points``. ``chance`` are LBAs of
+    random weights, ``visits`` the first stream's visits of each state.
     """
 
     patrol: Patrol
@@ -118,6 +135,8 @@ class MethodsStudy(NamedTuple):
     rates: tuple[float, ...]
     sweeps: Mapping[str, Float[np.ndarray, " rates"]]
     table: pandas.DataFrame
+    chance: Float[np.ndarray, " draws"]
+    visits: Float[np.ndarray, " S"]
 
 
 class _Entry(NamedTuple):
@@ -172,14 +191,21 @@ def study(
         advance(name, i / len(entries))
         rate = None
         if entry.tuned:
-            tried = [_accuracies(patrol, entry, float(r), tuning, points).mean(1) for r in rates]
+            tried = [_accuracies(patrol, entry, float(r), tuning, points)[0].mean(1) for r in rates]
             sweeps[name] = np.median(tried, axis=1)
             rate = chosen_rate(rates, sweeps[name])
-        measured = _accuracies(patrol, entry, 1.0 if rate is None else rate, streams, points)
-        curves.append(MethodCurve(name, measured, rate))
+        measured, weights = _accuracies(patrol, entry, 1.0 if rate is None else rate, streams, points)
+        curves.append(MethodCurve(name, measured, rate, weights))
     advance("done", 1.0)
     table = methods_table(patrol.mdp, streams[0][1])
-    return MethodsStudy(patrol, sessions, runs, seed, points, tuple(curves), tuple(rates), sweeps, table)
+    chance = chance_accuracy(
+        jax.random.fold_in(jax.random.key(seed), 200), patrol.mdp, jnp.asarray(patrol.weights)
+    )
+    first = streams[0][1]
+    visits = np.bincount(first.state[first.kind == SEEN], minlength=patrol.mdp.n_states).astype(float)
+    return MethodsStudy(
+        patrol, sessions, runs, seed, points, tuple(curves), tuple(rates), sweeps, table, chance, visits
+    )
 
 
 def _entries(patrol: Patrol) -> dict[str, _Entry]:
@@ -217,10 +243,11 @@ def _accuracies(
     rate: float,
     streams: Sequence[tuple[Array, Demonstration]],
     points: Int[np.ndarray, " points"],
-) -> Float[np.ndarray, "streams points"]:
+) -> tuple[Float[np.ndarray, "streams points"], Float[np.ndarray, "streams K"]]:
+    """Accuracy after so many pairs, and the weights in the end."""
     learner = entry.learner(rate)
     optimal = optimal_actions(patrol.mdp, jnp.asarray(patrol.weights))
-    rows = []
+    rows, final = [], []
     for key, windows in streams:
         sessions = list(entry.cut(windows.sessions()))
         reports = run_sessions(learner, sessions, key=key).reports
@@ -229,7 +256,8 @@ def _accuracies(
         # What was learned at the last session that had ended by then.
         learned = weights[np.searchsorted(seen, points, side="right") - 1]
         rows.append(np.asarray(_behaviour_accuracy(learner.mdp, optimal, jnp.asarray(learned))))
-    return np.array(rows)
+        final.append(weights[-1])
+    return np.array(rows), np.array(final)
 
 
 @jax.jit
@@ -262,10 +290,11 @@ def draw(study: MethodsStudy, theme: Theme) -> Figure:
         families.setdefault(_family(curve.name), []).append(i)
     panels = np.atleast_1d(figure.subplots(1, len(families), sharey=True))
     handles = []
+    styles = method_styles(theme, [curve.name for curve in study.curves])
     for panel, (family, members) in zip(panels, families.items(), strict=True):
         for i in members:
             curve = study.curves[i]
-            draw_band(panel, theme, i, curve.name, study.points, curve.accuracy, 0.5)
+            draw_band(panel, styles[curve.name], curve.name, study.points, curve.accuracy, 0.5)
         handles += panel.get_legend_handles_labels()[0]
         if len(study.curves) - 1 not in members:
             level = np.median(reference.accuracy, axis=0)
@@ -281,7 +310,13 @@ def draw(study: MethodsStudy, theme: Theme) -> Figure:
     panels[0].yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     head(figure, theme, handles + compared, title=_title(study))
     streams = len(reference.accuracy)
-    foot(figure, theme, f"line: median; band: middle 50% of {streams} patrollers watched")
+    foot(
+        figure,
+        theme,
+        "line: one patroller"
+        if streams == 1
+        else f"line: median; band: middle 50% of {streams} patrollers watched",
+    )
     return figure
 
 
@@ -291,7 +326,8 @@ def _family(name: str) -> str:
 
 def summary(study: MethodsStudy) -> dict[str, Any]:
     """Settings, curves, sweeps and the live Table 8.1 as plain data."""
-    return {
+    told: dict[str, Any] = plain({
+        "provenance": study_provenance(study.seed),
         "patrol": study.patrol.name,
         "sessions": study.sessions,
         "runs": study.runs,
@@ -303,12 +339,25 @@ def summary(study: MethodsStudy) -> dict[str, Any]:
                 "learning rate": curve.learning_rate,
                 "median accuracy": np.median(curve.accuracy, axis=0).tolist(),
                 "pairs to 90 %": _pairs_to(study, curve, 0.9),
+                "weights": curve.weights,
             }
             for curve in study.curves
         ],
         "sweeps": {name: scores.tolist() for name, scores in study.sweeps.items()},
         "table 8.1": study.table.to_dict("records"),
-    }
+        "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
+        "weights, first stream": None if (found := _estimates(study)) is None else found.summary(),
+    })  # fmt: skip
+    return told
+
+
+def _estimates(study: MethodsStudy) -> Estimates | None:
+    """Weights of the last method in the first stream, if they are of the process's features."""
+    mdp, weights = study.patrol.mdp, study.curves[-1].weights[0]
+    if not study.curves[-1].name.startswith(("LME", "ME")):
+        return None
+    information = complete_information(mdp, jnp.asarray(weights), jnp.asarray(study.visits))
+    return Estimates(mdp.feature_names, weights, laplace_errors(np.asarray(information)))
 
 
 def _pairs_to(study: MethodsStudy, curve: MethodCurve, level: float) -> int | None:
@@ -338,7 +387,7 @@ def _tables(study: MethodsStudy) -> tuple[Table, ...]:
         Table(
             ("method", "learning rate", "pairs to stay at 90 %", f"LBA after {study.points[-1]} pairs"),
             results,
-            "LBA: learned behaviour accuracy, median over streams (middle half).",
+            "Median over streams (middle half).",
         ),
         Table(
             ("mean LBA while learning", *(f"rate {rate:g}" for rate in study.rates)),
@@ -367,27 +416,56 @@ soft policy only approaches. With everything in view LME-I2RL and ME-I2RL are on
 differ in the statistic."""
 
 
+def _lead(study: MethodsStudy) -> Lead:
+    last = study.curves[-1]
+    final = float(np.median(last.accuracy[:, -1]))
+    reached = _pairs_to(study, last, 0.9)
+    name = last.name.split(",")[0]
+    at = "never stays at 90 %" if reached is None else f"stays at 90 % or more from {reached} pairs on"
+    quickest = [(pairs, c.name) for c in study.curves[:-1] if (pairs := _pairs_to(study, c, 0.9)) is not None]
+    others = f"; the quickest of the others does so from {min(quickest)[0]} on" if quickest else ""
+    learned = (
+        f"From {counted(int(study.points[-1]), 'state-action pair')} of {study.patrol.name}, {name} learned a "
+        f"reward whose policy does as the expert in {number(100 * final)} % of the states, and {at}{others}."
+    )
+    reach = float(np.mean(study.chance >= final - 1e-9))
+    streams = len(last.accuracy)
+    trust = (
+        (
+            "Trust no small difference, since one patroller was watched, "
+            if streams == 1
+            else f"Trust differences that exceed the spread of {streams} patrollers watched, "
+        )
+        + (
+            f"and no accuracy by itself: {number(100 * reach, 2)} % of random weights reach that one"
+            if reach > 0.05
+            else f"which chance does not explain: {number(100 * reach, 2)} % of random weights reach that "
+            "accuracy"
+        )
+        + f" (half of them {number(100 * float(np.median(study.chance)))} %)."
+    )
+    found = _estimates(study)
+    if found is None:
+        return Lead(learned, trust)
+    table = found.table(
+        f"Weights that {name} learned from the first stream, with intervals of the likelihood's "
+        "curvature there. A reward is known up to its length, hence the shares.",
+        np.asarray(study.patrol.weights),
+    )
+    return Lead(learned, trust, [table])
+
+
 def print_tables(study: MethodsStudy, console: Console) -> None:
     """Print the results, the sweeps and the live Table 8.1."""
-    from rich.table import Table as RichTable
-
-    for part in _tables(study):
-        table = RichTable(caption=part.caption, caption_justify="left")
-        for i, heading in enumerate(part.headings):
-            table.add_column(heading, justify="left" if i == 0 else "right")
-        for row in part.rows:
-            table.add_row(*map(str, row))
-        console.print(table)
+    print_page_tables(_tables(study), console, _title(study))
 
 
 def write(study: MethodsStudy, folder: Path | str) -> Path:
-    """Write the report: ``index.html``, the picture in both themes, and ``results.json``."""
-    folder = Path(folder)
-    light, dark = save_themes(partial(draw, study), folder, "methods")
-    picture = Picture(
-        light, dark, "Accuracy of the learned behaviour against the number of state-action pairs seen.",
+    """Write the page: ``index.html``, the picture in both themes, and ``results.json``."""
+    picture = drawn(
+        folder, "methods", partial(draw, study),
+        "Accuracy of the learned behaviour against the number of state-action pairs seen.",
         "Learned behaviour accuracy of each online method against pairs seen, on a logarithmic axis",
     )  # fmt: skip
-    (folder / "results.json").write_text(json.dumps(summary(study), indent=2) + "\n")
-    section = Section(_title(study), _TEXT, _tables(study), [picture])
-    return write_report(folder, [section], title="Online methods")
+    section = Section("Methods compared", _TEXT, _tables(study), [picture])
+    return write_page(folder, _title(study), _lead(study), [section], summary(study))

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Float
-from rich.console import Console
 
 from ..domains.breach_trials import REACHED, TIMED_OUT, BreachOutcome, breach_trials, greedy_policies
 from ..domains.patrol import Patrol, demonstrate, instance, simulate_patrol
@@ -33,9 +31,16 @@ from .figures import (
 )
 from .identifiability import Identifiability, identifiability_of, identifiability_section
 from .maps import hidden_path, policy_map
-from .metrics import demonstration_log_likelihoods, evaluate
-from .report import Picture, Section, Table, write_report
-from .style import Theme, save_themes
+from .metrics import chance_accuracy, demonstration_log_likelihoods, evaluate
+from .page import Lead, Section, Table, drawn, write_page
+from .page import print_tables as print_page_tables
+from .results import plain, study_provenance
+from .style import Theme
+from .text import counted, listed, number
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from rich.console import Console
 
 ONLINE, FORGETFUL, BATCH, RANDOM, TRUE = (
     "LME-I2RL", "LME-I2RL with random weights", "batch LME", "random weights", "true policy",
@@ -43,6 +48,10 @@ ONLINE, FORGETFUL, BATCH, RANDOM, TRUE = (
 # Names on the command line.
 METHODS = {"lme-i2rl": ONLINE, "batch": BATCH, "random": RANDOM}
 STEPS_PER_SESSION = 5
+# Numbers of trajectories at which batch is timed and judged.
+BATCH_POINTS = 7
+# Lengths that the true weights are stretched to.
+STRETCHES = 2.0 ** np.arange(-2, 14)
 
 Advance = Callable[[str, float | None], None]
 
@@ -92,6 +101,34 @@ class Study(NamedTuple):
     batch_rerun_seconds: np.ndarray | None
     stretch: Stretch
     determined: tuple[Identifiability, ...]
+    chance: Float[np.ndarray, " draws"]
+    truth: TrueLikelihood
+
+
+class TrueLikelihood(NamedTuple):
+    """Log-likelihood of the true weights at several lengths: an expert who never errs gives them none.
+
+    Fields
+    ------
+    lengths : float ``[L]``
+        Factors that the true weights are multiplied by.
+    values : float ``[L]``
+        Of the fresh demonstrations that methods are judged by; nats per trajectory.
+    """
+
+    lengths: Float[np.ndarray, " L"]
+    values: Float[np.ndarray, " L"]
+
+    @property
+    def as_given(self) -> float:
+        """At the true weights themselves."""
+        return float(self.values[self.lengths == 1][0])
+
+    @property
+    def best(self) -> tuple[float, float]:
+        """The length with the highest likelihood, and that."""
+        i = int(np.argmax(self.values))
+        return float(self.lengths[i]), float(self.values[i])
 
 
 class Stretch(NamedTuple):
@@ -157,10 +194,15 @@ def study(
         identifiability_of(patrol.mdp, view, demonstration, jnp.asarray(weights[-1]))
         for demonstration, weights in zip(known, first.weights[0], strict=False)
     )
+    chance = chance_accuracy(jax.random.fold_in(keys[0], 200), patrol.mdp, jnp.asarray(patrol.weights))
+    truth = TrueLikelihood(
+        STRETCHES, _likelihoods(patrol, observability, STRETCHES[:, None] * np.asarray(patrol.weights))
+    )
     advance("done", 1.0)
     return Study(
-        patrol, observability, sessions, trials, runs, seed, tuple(results), rerun, stretch, determined
-    )
+        patrol, observability, sessions, trials, runs, seed, tuple(results), rerun, stretch, determined,
+        chance, truth,
+    )  # fmt: skip
 
 
 class _Learned(NamedTuple):
@@ -187,7 +229,7 @@ def _batch(batch: Any, key: jax.Array, demonstrations: Sequence[Demonstration]) 
     import time
 
     n = demonstrations[0].n_trajectories
-    points = np.unique(np.geomspace(min(5, n), n, 3).round().astype(int))
+    points = np.unique(np.geomspace(min(5, n), n, BATCH_POINTS).round().astype(int))
     weights, seconds = [], []
     for count in points:
         part = [d.select(slice(0, int(count))) for d in demonstrations]
@@ -203,6 +245,19 @@ def _random(patrol: Patrol, key: jax.Array, demonstrations: Sequence[Demonstrati
     shape = (patrol.patrollers, 1, patrol.mdp.n_features)
     weights = np.asarray(jax.random.uniform(key, shape, float, -0.99, 0.99))
     return _not_learned(weights, demonstrations)
+
+
+def _likelihoods(
+    patrol: Patrol, observability: int, weights: Float[np.ndarray, "n K"]
+) -> Float[np.ndarray, " n"]:
+    """Nats per trajectory of fresh demonstrations, the same for everybody and learned from by nobody."""
+    fresh = concatenate(demonstrate(jax.random.key(10**6), patrol, observability, 60, STEPS_PER_SESSION))
+    view = patrol.visibility(observability)
+    likelihood = lax.map(
+        lambda w: jnp.mean(demonstration_log_likelihoods(patrol.mdp, view, w, fresh)),
+        jnp.asarray(weights), batch_size=16,
+    )  # fmt: skip
+    return np.asarray(likelihood)
 
 
 def _true(patrol: Patrol, key: jax.Array, demonstrations: Sequence[Demonstration]) -> _Learned:
@@ -236,13 +291,7 @@ def _evaluated(
         jnp.asarray(weights).reshape(-1, k)
     )
     shape = (runs * patrollers, n)
-    # Everybody is judged by the same fresh demonstrations, learned from by nobody.
-    fresh = concatenate(demonstrate(jax.random.key(10**6), patrol, observability, 60, STEPS_PER_SESSION))
-    view = patrol.visibility(observability)
-    likelihood = lax.map(
-        lambda w: jnp.mean(demonstration_log_likelihoods(patrol.mdp, view, w, fresh)),
-        jnp.asarray(weights).reshape(-1, k), batch_size=16,
-    )  # fmt: skip
+    likelihood = _likelihoods(patrol, observability, weights.reshape(-1, k))
     breach = None
     if patrol.breach is not None:
         outcomes = [
@@ -260,7 +309,7 @@ def _evaluated(
     return MethodResult(
         name, learned[0].points, weights, np.asarray(scores.accuracy.overall).reshape(shape),
         np.asarray(scores.accuracy.choice).reshape(shape), np.asarray(scores.error.relative).reshape(shape),
-        np.asarray(likelihood).reshape(shape), np.stack([one.seconds for one in learned]), breach,
+        likelihood.reshape(shape), np.stack([one.seconds for one in learned]), breach,
     )  # fmt: skip
 
 
@@ -309,7 +358,17 @@ def _rows(study: Study) -> list[dict[str, Any]]:
 
 def summary(study: Study) -> dict[str, Any]:
     """The study's settings and results as plain data."""
-    return {
+    reward: dict[str, Any] = {
+        "features": list(study.patrol.mdp.feature_names),
+        "true weights": study.patrol.weights,
+        "learned, first run": [
+            {"patroller": who, "method": study.methods[0].name, "weights": found.estimates.summary()}
+            for who, found in _by_patroller(study).items()
+        ],
+        "by method, run and patroller": {m.name: m.weights[:, :, -1] for m in study.methods},
+    }
+    told: dict[str, Any] = plain({
+        "provenance": study_provenance(study.seed),
         "patrol": study.patrol.name,
         "observability": study.observability,
         "sessions": study.sessions,
@@ -317,7 +376,11 @@ def summary(study: Study) -> dict[str, Any]:
         "runs": study.runs,
         "seed": study.seed,
         "methods": _rows(study),
-    }
+        "reward": reward,
+        "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
+        "true weights": study.truth._asdict(),
+    })  # fmt: skip
+    return told
 
 
 _HEADINGS = (
@@ -325,72 +388,143 @@ _HEADINGS = (
     "LBA",
     "LBA, choice states",
     "ILE",
+    "nats a trajectory",
     "success (95 % interval)",
     "time-outs",
     "s / session",
 )
 
 
-def _cells(study: Study) -> list[tuple[str, ...]]:
-    def percent(x: float | None) -> str:
-        return "-" if x is None else f"{100 * x:.1f} %"
+def _percent(x: float | None, digits: int = 1) -> str:
+    return "-" if x is None else f"{100 * x:.{digits}f} %"
 
+
+def _results_table(study: Study) -> Table:
     cells: list[tuple[str, ...]] = []
     for row in _rows(study):
         interval = row["success interval"]
-        success = percent(row["success"])
+        success = _percent(row["success"])
         if interval is not None:
             success += f" ({100 * interval[0]:.0f}-{100 * interval[1]:.0f})"
-        seconds = row["seconds per session"]
         cells.append((
-            row["method"], percent(row["LBA"]), percent(row["LBA choice states"]), f"{row['ILE']:.4f}",
-            success, percent(row["time-outs"]), "-" if seconds is None else f"{seconds:.4f}",
+            row["method"], _percent(row["LBA"]), _percent(row["LBA choice states"]), f"{row['ILE']:.4f}",
+            f"{row['log-likelihood']:.3f}", success, _percent(row["time-outs"]),
+            number(row["seconds per session"]),
         ))  # fmt: skip
-    return cells
+    return Table(_HEADINGS, cells, _CAPTION)
 
 
 _CAPTION = (
-    "Medians over runs and patrollers. LBA: learned behaviour accuracy. ILE: inverse learning error "
-    "relative to the optimal value. Seconds: all patrollers together; for batch, those of one run over "
-    "everything, spent again at each session."
+    "Medians over runs and patrollers. ILE is relative to the optimal value. Nats: log-likelihood of fresh "
+    "demonstrations. Seconds: all patrollers together; for batch, those of one run over everything, spent "
+    "again at each session."
 )
 
 
-def print_table(study: Study, console: Console) -> None:
+def print_tables(study: Study, console: Console) -> None:
     """Print the results."""
-    from rich.table import Table as RichTable
-
-    table = RichTable(title=_title(study), caption=_CAPTION, caption_justify="left")
-    for i, heading in enumerate(_HEADINGS):
-        table.add_column(heading, justify="left" if i == 0 else "right")
-    for row in _cells(study):
-        table.add_row(*row)
-    console.print(table)
+    print_page_tables([_results_table(study)], console, _settings(study))
 
 
-def _title(study: Study) -> str:
-    return (
-        f"{study.patrol.name}, {study.observability} % in view, {study.sessions} sessions, "
-        f"{study.runs} runs of {study.trials} breaches"
+def _settings(study: Study) -> str:
+    told = (
+        f"{study.patrol.name}, {study.observability} % in view, {counted(study.sessions, 'session')} of "
+        f"{STEPS_PER_SESSION} steps, {counted(study.runs, 'run')}"
     )
+    return told if study.patrol.breach is None else f"{told} of {counted(study.trials, 'breach')}"
+
+
+# -- the page -------------------------------------------------------------------------------------------
+
+
+def _by_patroller(study: Study) -> dict[str, Identifiability]:
+    names = (
+        ("the patroller",) if len(study.determined) == 1 else ("the first patroller", "the second patroller")
+    )
+    return dict(zip(names, study.determined, strict=False))
+
+
+def _lead(study: Study) -> Lead:
+    first, row = study.methods[0], _rows(study)[0]
+    if not study.determined:
+        return Lead(
+            f"Nothing was learned here: {listed([m.name for m in study.methods])} were only measured.",
+            "Trust the numbers as those of a control.",
+        )
+    whose = "the patroller's reward" if len(study.determined) == 1 else "the rewards of both patrollers"
+    learned = (
+        f"From {counted(study.sessions, 'session')} with {study.observability} % of {study.patrol.name} in "
+        f"view, {first.name} learned {whose}: the best policy of what was learned does as the expert in "
+        f"{number(100 * row['LBA'])} % of the states and loses {_lost(row['ILE'])} of the value."
+    )
+    vague = sum(len(found.directions) for found in study.determined)
+    total = sum(len(found.features) for found in study.determined)
+    weights = (
+        "and the demonstrations determine every direction of the weights"
+        if not vague
+        else f"and the demonstrations leave {'all' if vague == total else f'{vague} of the'} {total} "
+        "directions of the weights open, so trust the policy rather than single weights"
+    )
+    reach = _share_as_good(study)
+    trust = (
+        f"That accuracy is no evidence, since {_percent(reach, 0)} of random weights reach it as well; "
+        "trust the likelihood of fresh demonstrations instead, "
+        if reach > 0.05
+        else f"Chance does not explain the accuracy, since {_percent(reach, 1)} of random weights reach it, "
+    )
+    tables = [
+        found.estimates.table(
+            f"Weights of {who} that {first.name} learned in the first run. Intervals are those of the "
+            "likelihood's curvature there; a reward is known up to its length, hence the shares.",
+            np.asarray(study.patrol.weights),
+        )
+        for who, found in _by_patroller(study).items()
+    ]
+    return Lead(learned, f"{trust}{weights}.", tables)
+
+
+def _lost(error: float) -> str:
+    return "nothing" if error < 5e-7 else f"{number(100 * error)} %"
+
+
+def _share_as_good(study: Study) -> float:
+    """Share of random weights whose LBA is that of the first method, or more."""
+    return float(np.mean(study.chance >= np.median(study.methods[0].accuracy[:, -1]) - 1e-9))
+
+
+def _text(study: Study) -> str:
+    first = study.methods[0]
+    reached, median = np.median(first.accuracy[:, -1]), float(np.median(study.chance))
+    stretched, best = study.truth.best
+    learned = float(np.median(first.log_likelihood[:, -1]))
+    return f"""Settings: {_settings(study)}.
+
+Chance: of {counted(len(study.chance), "weight vector")} drawn at random, half have an LBA of at least \
+{_percent(median)}, and {_percent(_share_as_good(study))} have the {_percent(float(reached))} of \
+{first.name} or more. The row of random weights is one such draw a patroller and run.
+
+Likelihood: it is that of a policy which errs the less the longer its weights are, and the patrollers never \
+err. The true weights are given in no such units. As given they reach {number(study.truth.as_given)} nats a \
+trajectory, stretched {number(stretched)} times {number(best)}, and {first.name} {number(learned)}. Learned \
+weights maximise the likelihood of what was seen, their length included; the true weights maximise nothing, \
+so that a likelihood above theirs is no error."""
 
 
 def write(study: Study, folder: Path | str) -> Path:
-    """Write the report: ``index.html``, the pictures in both themes, and ``results.json``."""
-    folder = Path(folder)
+    """Write the page: ``index.html``, the pictures in both themes, and ``results.json``."""
     first = study.methods[0]
     policy = greedy_policies(study.patrol, first.weights[0, :1, -1])[0]
-    drawings: list[tuple[str, Callable[[Theme], Any], str, str]] = [
-        (
-            "policy", lambda theme: policy_map(
+    pictures = [
+        drawn(
+            folder, "policy", lambda theme: policy_map(
                 study.patrol, np.exp(np.asarray(policy)), study.observability, theme=theme,
                 title=f"Policy of {first.name}",
             ),
             "What the first patroller is believed to do in every state; tinted cells are in view.",
             "Map of the patrol with the learned policy as arrows",
         ),
-        (
-            "hidden-path", lambda theme: hidden_path(
+        drawn(
+            folder, "hidden-path", lambda theme: hidden_path(
                 study.patrol, study.stretch.posterior, study.stretch.seen, study.stretch.path, theme=theme
             ),
             "A stretch of patrol nobody learned from: belief about the hidden steps, given the seen ones.",
@@ -400,51 +534,42 @@ def write(study: Study, folder: Path | str) -> Path:
     learning = [m for m in study.methods if m.name not in (RANDOM, TRUE)]
     if learning:
         curves = [LearningCurve(m.name, m.points, m.accuracy, m.log_likelihood) for m in learning]
-        drawings.append((
-            "learning", lambda theme: learning_curves(curves, theme=theme),
+        pictures.append(drawn(
+            folder, "learning", lambda theme: learning_curves(curves, theme=theme),
             "Accuracy of the learned behaviour, and likelihood of fresh demonstrations, as sessions go by.",
             "Accuracy and log-likelihood against sessions",
         ))  # fmt: skip
-        times = [
-            LearningTime(m.name if m.name != BATCH else "batch LME, one run", m.points, m.seconds)
-            for m in learning
-        ]
-        if study.batch_rerun_seconds is not None:
-            every = np.arange(1, study.sessions + 1)
-            times.append(
-                LearningTime("batch LME, again after every session", every, study.batch_rerun_seconds)
-            )
-        drawings.append((
-            "time", lambda theme: learning_time(times, theme=theme),
-            "Learning time of all patrollers together, without compilation. Batch was timed at three points; "
-            "running it after every session is summed by interpolation between them.",
+        pictures.append(drawn(
+            folder, "time", partial(_draw_time, study, learning),
+            "Learning time of all patrollers together, without compilation. Running batch after every "
+            f"session is summed by interpolation between the {BATCH_POINTS} points at which it was timed.",
             "Learning time against trajectories",
         ))  # fmt: skip
-    breached = [m for m in study.methods if m.breach is not None]
-    if breached:
-        rates = [
-            SuccessRate(m.name, int((ended == REACHED).sum()), int((ended == TIMED_OUT).sum()), len(ended))
-            for m in breached
-            if m.breach is not None
-            for ended in [m.breach.ended]
-        ]
-        drawings.append((
-            "success", lambda theme: success_rates(rates, theme=theme),
+    rates = [
+        SuccessRate(m.name, int((ended == REACHED).sum()), int((ended == TIMED_OUT).sum()), len(ended))
+        for m in study.methods
+        if m.breach is not None
+        for ended in [m.breach.ended]
+    ]
+    if rates:
+        pictures.append(drawn(
+            folder, "success", lambda theme: success_rates(rates, theme=theme),
             "Share of simulated breaches that reached a goal unseen, and that timed out.",
             "Success and time-out rates by method",
         ))  # fmt: skip
-    pictures = []
-    for name, draw, caption, description in drawings:
-        light, dark = save_themes(draw, folder, name)
-        pictures.append(Picture(light, dark, caption, description))
-    table = Table(_HEADINGS, _cells(study), _CAPTION)
-    (folder / "results.json").write_text(json.dumps(summary(study), indent=2) + "\n")
-    sections = [Section(_title(study), "", [table], pictures)]
+    sections = [Section("Results", _text(study), [_results_table(study)], pictures)]
     if study.determined:
-        names = (
-            ("the patroller",)
-            if len(study.determined) == 1
-            else ("the first patroller", "the second patroller")
-        )
-        sections.append(identifiability_section(dict(zip(names, study.determined, strict=True))))
-    return write_report(folder, sections, title="Patrol")
+        sections.append(identifiability_section(_by_patroller(study)))
+    title = f"What {study.patrol.name}'s patrollers want"
+    return write_page(folder, title, _lead(study), sections, summary(study))
+
+
+def _draw_time(study: Study, learning: Sequence[MethodResult], theme: Theme) -> Figure:
+    times = [
+        LearningTime(m.name if m.name != BATCH else "batch LME, one run", m.points, m.seconds)
+        for m in learning
+    ]
+    if study.batch_rerun_seconds is not None:
+        every = np.arange(1, study.sessions + 1)
+        times.append(LearningTime("batch LME, again after every session", every, study.batch_rerun_seconds))
+    return learning_time(times, theme=theme)

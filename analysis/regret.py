@@ -41,7 +41,8 @@ from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import reward_of, soft_plan
 from .metrics import quantile_band
-from .style import LIGHT, TEXT, Theme, dress, foot, head, new_figure, series_style
+from .style import LIGHT, TEXT, Theme, dress, foot, head, method_styles, new_figure
+from .text import counted
 
 # -- what the expert does -----------------------------------------------------------------------------
 
@@ -245,9 +246,10 @@ def regret_plot(
     handles: list[Line2D] = []
     surely: list[Line2D] = []
     sessions = np.arange(1, lengths.pop() + 1)
-    for i, curve in enumerate(curves):
+    styles = method_styles(theme, [curve.name for curve in curves])
+    for curve in curves:
         slope = log_log_slope(np.mean(curve.expected, axis=0), burn_in)
-        color, dashes = series_style(theme, i)["color"], series_style(theme, i)["linestyle"]
+        color, dashes = styles[curve.name]["color"], styles[curve.name]["linestyle"]
         for axes, values in ((left, curve.expected), (right, curve.empirical)):
             band = quantile_band(values, coverage)
             axes.fill_between(sessions, band.low, band.high, color=color, alpha=0.18, linewidth=0)
@@ -272,7 +274,7 @@ def regret_plot(
     runs = np.shape(curves[0].expected)[0]
     foot(
         figure, theme,
-        f"lines: medians of {runs} streams; bands: central {coverage:.0%}; "
+        f"lines: medians of {counted(runs, 'stream')}; bands: central {coverage:.0%}; "
         f"slopes: least squares of the mean over every T from {burn_in} on",
     )  # fmt: skip
     return figure

@@ -33,13 +33,15 @@ from ..models.planning import finite_occupancy, reachable_states
 from .figures import set_scale
 from .metrics import greedy_policy, optimal_actions, policy_accuracy
 from .multi_task_metrics import match_ways
-from .style import MARKERS, SMALL, TEXT, Theme, dress, foot, head, new_figure, series_style
+from .style import MARKERS, SMALL, TEXT, Theme, dress, foot, head, method_styles, new_figure
+from .text import counted
 
 if TYPE_CHECKING:
     from .sorting_study import SortingStudy
 
 # Legends and notes need so many inches, however few the panels are.
 _WIDTH_OF_TEXT = 6.5
+_COLOURS = len(MARKERS)
 
 # -- clusters -----------------------------------------------------------------------------------------
 
@@ -98,11 +100,10 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
                 rows_here = (study.labels == b) & (result.found.assignments == way)
                 panel.plot(
                     *embedding.points[rows_here].T, linestyle="", marker=MARKERS[b], markersize=7,
-                    markerfacecolor="none", markeredgecolor=theme.series[d % 6], markeredgewidth=1.5,
+                    markerfacecolor="none", markeredgecolor=theme.series[d % _COLOURS], markeredgewidth=1.5,
                     alpha=0.85,
                 )  # fmt: skip
-        noun = "way" if found == 1 else "ways"
-        dress(panel, theme, title=f"{result.name}: {found} {noun}")
+        dress(panel, theme, title=f"{result.name}: {counted(found, 'way')}")
         panel.margins(0.12)
         if i >= len(results) - columns:
             panel.set_xlabel(f"component 1 ({embedding.shares[0]:.1%} of variance)", color=theme.ink)
@@ -118,11 +119,12 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
         for b in range(study.tasks)
     ]  # fmt: skip
     handles += [
-        Line2D([], [], linestyle="", marker="o", markersize=8, color=theme.series[d % 6],
-               label=f"found: way {d + 1}" + (" (more reuse colours)" if d == 5 < most - 1 else ""))
-        for d in range(min(most, 6))
+        Line2D([], [], linestyle="", marker="o", markersize=8, color=theme.series[d % _COLOURS],
+               label=f"found: way {d + 1}"
+               + (" (more reuse colours)" if d == _COLOURS - 1 < most - 1 else ""))
+        for d in range(min(most, _COLOURS))
     ]  # fmt: skip
-    head(figure, theme, handles, title=f"{len(study.labels)} trajectories, first run")
+    head(figure, theme, handles, title=f"{counted(len(study.labels), 'trajectory')}, first run")
     told = ";\n".join(f"component {k + 1}: {_loading(mdp, embedding.loadings[k])}" for k in range(2))
     foot(figure, theme, told)
     return figure
@@ -210,7 +212,7 @@ def ways_diagram(study: SortingStudy, theme: Theme) -> Figure:
         policy = np.asarray(greedy_policy(sorting.mdp, jnp.asarray(result.found.weights[way])))
         draw_flow(panel, theme, sorting, flow_of(sorting, policy, study.steps))
         panel.set_title(
-            f"Way {number}: {sizes[way]} of {len(study.labels)} trajectories\n"
+            f"Way {number}: {sizes[way]} of {counted(len(study.labels), 'trajectory')}\n"
             + _likeness(sorting, policy, behaviour_of.get(way)),
             color=theme.ink, fontsize=TEXT + 1, loc="left",
         )  # fmt: skip
@@ -333,7 +335,12 @@ def evd_plot(study: SortingStudy, theme: Theme) -> Figure:
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
     _at_counts(axes, study)
-    head(figure, theme, axes.get_legend_handles_labels()[0], title=f"Value lost, {study.tasks} tasks")
+    head(
+        figure,
+        theme,
+        axes.get_legend_handles_labels()[0],
+        title=f"Value lost, {counted(study.tasks, 'task')}",
+    )
     foot(
         figure,
         theme,
@@ -351,7 +358,8 @@ def _draw_runs(
     middle: Float[np.ndarray, " T"],
 ) -> None:
     """The ``i``-th method's runs, beside those of the others: bands of so many could not be told apart."""
-    style, result = series_style(theme, i), study.results[i]
+    result = study.results[i]
+    style = method_styles(theme, [r.name for r in study.results])[result.name]
     x = result.trajectories * np.exp(0.05 * (i - (len(study.results) - 1) / 2))
     axes.plot(
         np.broadcast_to(x, values.shape).ravel(), values.ravel(), linestyle="", markersize=4.5, alpha=0.5,
@@ -414,12 +422,14 @@ def time_plot(study: SortingStudy, theme: Theme) -> Figure:
 
 
 def _all_runs(study: SortingStudy) -> str:
-    return "the one run" if study.runs == 1 else f"all {study.runs} runs"
+    return "the one run" if study.runs == 1 else f"all {counted(study.runs, 'run')}"
 
 
 def _at_counts(axes: Axes, study: SortingStudy) -> None:
     ticks = sorted({int(n) for result in study.results for n in result.trajectories})
     axes.set_xscale("log")
     axes.set_xticks(ticks, [f"{n}" for n in ticks])
+    # A single number of trajectories is one place, however many methods stand side by side there.
+    axes.set_xlim(ticks[0] / 1.5, ticks[-1] * 1.5)
     axes.xaxis.set_minor_locator(NullLocator())
     axes.xaxis.set_minor_formatter(NullFormatter())

@@ -2,27 +2,32 @@
 
 from __future__ import annotations
 
-import json
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..inference.mtirl import DEFAULT_RESTARTS
+from ..models.demonstration import SEEN
 from . import sorting_figures as figures
-from .report import Picture, Section, Table, write_report
+from .estimates import Estimates, laplace_errors
+from .information import complete_information
+from .multi_task_metrics import match_ways
+from .page import Lead, Section, Table, drawn, write_page
+from .page import print_tables as print_page_tables
+from .results import plain, study_provenance
 from .sorting_study import BATCH, DPM, EM, EM_UNTOLD, FEW, METHODS, ONLINE, SortingStudy
 from .sorting_table import (
     HEADINGS,
     behaviours,
     caption,
     cells,
-    print_sorting_table,
     sorting_table_plot,
     sorting_table_summary,
 )
-from .style import save_themes
+from .text import counted, listed, number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -30,7 +35,8 @@ if TYPE_CHECKING:
 
 def summary(study: SortingStudy) -> dict[str, Any]:
     """Settings and all measures as plain data."""
-    return {
+    told: dict[str, Any] = plain({
+        "provenance": study_provenance(study.seed),
         "process": study.sorting.name,
         "tasks": study.tasks,
         "behaviours": list(study.sorting.behaviours[: study.tasks]),
@@ -54,8 +60,36 @@ def summary(study: SortingStudy) -> dict[str, Any]:
             }
             for result in study.results
         ],
+        "ways of the first run": [
+            {"way": way, "weights": found.summary()} for way, found in _estimates(study).items()
+        ],
         "table 7.2": sorting_table_summary(study.table),
-    }
+    })  # fmt: skip
+    return told
+
+
+def _estimates(study: SortingStudy) -> dict[str, Estimates]:
+    """Weights of every way that the first method found in the first run, named after what it is like.
+
+    Errors of maximum-entropy methods are those of the likelihood's curvature, given who did what; other
+    likelihoods have another curvature, and their weights no errors here.
+    """
+    result, mdp = study.results[0], study.sorting.mdp
+    demonstration = study.demonstration
+    behaviour_of = {way: b for b, way in match_ways(study.labels, result.found.assignments).items()}
+    seen = demonstration.kind == SEEN
+    found = {}
+    for way in np.unique(result.found.assignments).tolist():
+        weights = np.asarray(result.found.weights[way])
+        errors = np.full(len(weights), np.inf)
+        if result.name in (METHODS[BATCH], METHODS[ONLINE]):
+            share = np.broadcast_to(result.found.responsibilities[:, way, None], seen.shape)
+            visits = np.bincount(demonstration.state[seen], share[seen], mdp.n_states)
+            information = complete_information(mdp, jnp.asarray(weights), jnp.asarray(visits))
+            errors = laplace_errors(np.asarray(information))
+        name = study.sorting.behaviours[behaviour_of[way]] if way in behaviour_of else "like no behaviour"
+        found[f"way {len(found) + 1}, {name}"] = Estimates(mdp.feature_names, weights, errors)
+    return found
 
 
 def _results_table(study: SortingStudy) -> Table:
@@ -66,12 +100,12 @@ def _results_table(study: SortingStudy) -> Table:
             evd = m.value_difference[:, t]
             rows.append((
                 result.name if t == 0 else "", f"{n}",
-                f"{evd.mean():.3g} ({evd.min():.3g}-{evd.max():.3g})",
-                f"{evd.mean() / study.steps:.2g}",
+                f"{number(evd.mean())} ({number(evd.min())} to {number(evd.max())})",
+                number(evd.mean() / study.steps, 2),
                 f"{np.median(m.ways[:, t]):g} ({(m.ways[:, t] == study.tasks).sum()} of {study.runs})",
                 f"{100 * m.accuracy[:, t].mean():.1f}",
                 f"{m.rand[:, t].mean():.3f}",
-                f"{np.median(m.seconds[:, t]):.3g}",
+                number(np.median(m.seconds[:, t])),
             ))  # fmt: skip
     share = study.online_share
     online = (
@@ -83,7 +117,7 @@ def _results_table(study: SortingStudy) -> Table:
         ("method", "N", "EVD (all runs)", "a step", "ways (right in)", "accuracy, %", "Rand", "seconds"),
         rows,
         f"N: trajectories. EVD: mean of {_runs(study)}, in discounted reward a trajectory; the best "
-        f"single behaviour for all has {study.one_way:.3g}. Ways: median number found. "
+        f"single behaviour for all has {number(study.one_way)}. Ways: median number found. "
         "Rand: adjusted Rand index. "
         f"Seconds: median, without compilation; online: all sessions so far.{online}",
     )
@@ -91,11 +125,11 @@ def _results_table(study: SortingStudy) -> Table:
 
 def _title(study: SortingStudy) -> str:
     names = study.sorting.behaviours[: study.tasks]
-    return f"Sorting onions in {study.tasks} ways: {', '.join(names[:-1])} and {names[-1]}"
+    return f"Sorting onions in {study.tasks} ways: {listed(names)}"
 
 
 def _runs(study: SortingStudy) -> str:
-    return "one run" if study.runs == 1 else f"{study.runs} independent runs"
+    return "one run" if study.runs == 1 else counted(study.runs, "independent run")
 
 
 def _text(study: SortingStudy) -> str:
@@ -125,40 +159,69 @@ def _scope(study: SortingStudy) -> str:
     told = []
     if tuple(study.counts) == FEW[study.tasks]:
         told.append(
-            "These are few numbers of trajectories, since every method is compiled for each: --trajectories "
-            "all --runs 10 is the dissertation's design."
+            "These are few numbers of trajectories, since every method is compiled for each; the "
+            "dissertation's design is `--trajectories all --runs 10`."
         )
     if study.counts[0] < study.ways:
         told.append(
-            f"From {study.counts[0]} trajectories no more than {study.counts[0]} of the {study.ways} ways "
-            "started from can be found."
+            f"From {counted(int(study.counts[0]), 'trajectory')} no more than {study.counts[0]} of the "
+            f"{study.ways} ways started from can be found."
         )
     return " ".join(told)
 
 
+def _sorting_tables(study: SortingStudy) -> list[Table]:
+    """Table 7.2, a table a behaviour."""
+    return [
+        Table(HEADINGS, cells(study.table, behaviour), f"Table 7.2, {behaviour}. {caption(study.table)}")
+        for behaviour in behaviours(study.table)
+    ]
+
+
 def print_tables(study: SortingStudy, console: Console) -> None:
     """Print the results and Table 7.2."""
-    from rich.table import Table as RichTable
+    print_page_tables([_results_table(study)], console, f"{_title(study)}. {_scope(study)}")
+    print_page_tables(_sorting_tables(study), console)
 
-    part = _results_table(study)
-    table = RichTable(title=_title(study), caption=part.caption, caption_justify="left")
-    for i, heading in enumerate(part.headings):
-        table.add_column(heading, justify="left" if i == 0 else "right")
-    for i, row in enumerate(part.rows):
-        if i and row[0]:
-            table.add_section()
-        table.add_row(*map(str, row))
-    console.print(table)
-    if _scope(study):
-        console.print(_scope(study), highlight=False)
-    print_sorting_table(study.table, console)
+
+def _lead(study: SortingStudy) -> Lead:
+    result = study.results[0]
+    m, n = result.measures, int(result.trajectories[-1])
+    right, lost = int((m.ways[:, -1] == study.tasks).sum()), float(m.value_difference[:, -1].mean())
+    found = f"{float(np.median(m.ways[:, -1])):g}"
+    learned = (
+        f"From one jumble of {counted(n, 'trajectory')} {result.name} learned {found} ways of sorting, where "
+        f"{study.tasks} were demonstrated, put {number(100 * float(m.accuracy[:, -1].mean()))} % of the "
+        f"trajectories in the right one, and loses {number(lost)} of the value, where one way for all "
+        f"loses {number(study.one_way)}."
+    )
+    known = right == study.runs and lost < 0.1 * study.one_way
+    spread = "one run shows no spread" if study.runs == 1 else f"so it was in {right} of {study.runs} runs"
+    trust = (
+        f"Trust the ways and what they do ({spread}); the weights of experts who never err have no scale of "
+        "their own, so trust their signs where an interval leaves zero out."
+        if known
+        else "Do not trust it as it is: the true number was found in "
+        f"{right} of {counted(study.runs, 'run')}, and more trajectories may be needed."
+    )
+    tables = [
+        estimates.table(
+            f"Weights of {way}, that {result.name} found in the first run. "
+            + (
+                "Intervals are those of the likelihood's curvature, given who did what."
+                if np.isfinite(estimates.errors).any()
+                else "Its likelihood bounds no weight from above here, or none was computed."
+            )
+        )
+        for way, estimates in _estimates(study).items()
+    ]
+    return Lead(learned, trust, tables)
 
 
 def write(study: SortingStudy, folder: Path | str) -> Path:
-    """Write the report: ``index.html``, the pictures in both themes, and ``results.json``."""
-    folder = Path(folder)
+    """Write the page: ``index.html``, the pictures in both themes, and ``results.json``."""
     pictures = [
-        Picture(*save_themes(draw, folder, name), told, description)
+        drawn(folder, name, draw, told, description)
         for name, draw, told, description in (
             ("clusters", partial(figures.clusters_plot, study),
              "All trajectories of the first run by what they count: which way each was done, and which it "
@@ -181,17 +244,13 @@ def write(study: SortingStudy, folder: Path | str) -> Path:
              "Precision and recall of every method for both behaviours"),
         )
     ]  # fmt: skip
-    (folder / "results.json").write_text(json.dumps(summary(study), indent=2) + "\n")
-    learned = Section(_title(study), _text(study), [_results_table(study)], pictures[:-1])
+    learned = Section("Found in the jumble", _text(study), [_results_table(study)], pictures[:-1])
     sorted_ = Section(
-        "Table 7.2",
-        f"The weights that each method learned from all {study.counts[-1]} trajectories of the first run, "
-        "each way matched with the behaviour it shares most trajectories with. A behaviour for which no "
-        "way was left is carried out as the way that most of its trajectories were put in.",
-        [
-            Table(HEADINGS, cells(study.table, behaviour), f"{behaviour}. {caption(study.table)}")
-            for behaviour in behaviours(study.table)
-        ],
+        "Sorting as was learned",
+        f"The weights that each method learned from all {counted(int(study.counts[-1]), 'trajectory')} of "
+        "the first run, each way matched with the behaviour it shares most trajectories with. A behaviour "
+        "for which no way was left is carried out as the way that most of its trajectories were put in.",
+        _sorting_tables(study),
         pictures[-1:],
     )
-    return write_report(folder, [learned, sorted_], title="Sorting onions")
+    return write_page(folder, _title(study), _lead(study), [learned, sorted_], summary(study))

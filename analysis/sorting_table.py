@@ -30,7 +30,9 @@ from matplotlib.ticker import PercentFormatter
 from ..domains.sorting import Sorting
 from ..domains.sorting_line import Line, Share, Tally, sort_belts, wilson
 from .metrics import greedy_policy, optimal_actions, policy_accuracy
-from .style import LIGHT, TEXT, Theme, dress, foot, head, new_figure
+from .page import Table, print_tables
+from .style import LIGHT, TEXT, Theme, dress, foot, head, name_ticks, new_figure
+from .text import counted
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -219,8 +221,8 @@ def caption(table: SortingTable) -> str:
     """What the columns mean."""
     return (
         "TP, FP: blemished and good onions in the bin; TN, FN: good and blemished ones left on the table. "
-        f"Simulated: means of {table.belts:,} belts; dissertation: its one belt of 24 onions. In brackets: "
-        f"{table.level:.0%} intervals, Wilson's for the latter. LBA: over states with a choice. "
+        f"Simulated: means of {counted(table.belts, 'belt')}; dissertation: its one belt of 24 onions. In "
+        f"brackets: {table.level:.0%} intervals, Wilson's for the latter. LBA: over states with a choice. "
         "The simulated line is calibrated to the dissertation's expert only."
     )
 
@@ -258,18 +260,9 @@ def cells(table: SortingTable, behaviour: str) -> list[tuple[str, ...]]:
 
 def print_sorting_table(table: SortingTable, console: Console) -> None:
     """Print one table for each behaviour."""
-    from rich.table import Table
-
     for behaviour in behaviours(table):
-        shown = Table(title=f"{behaviour} (Table 7.2)")
-        for i, heading in enumerate(HEADINGS):
-            shown.add_column(heading, justify="left" if i < 2 else "right")
-        for i, line in enumerate(cells(table, behaviour)):
-            if i and line[0]:
-                shown.add_section()
-            shown.add_row(*line)
-        console.print(shown)
-    console.print(caption(table), highlight=False)
+        shown = Table(HEADINGS, cells(table, behaviour), caption(table))
+        print_tables([shown], console, f"{behaviour} (Table 7.2)")
 
 
 def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str = "") -> Figure:
@@ -309,7 +302,7 @@ def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str 
             )  # fmt: skip
             panel.set_xlim(0, 1.02)
             panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
-        panels[i, 0].set_yticks(range(len(methods)), methods, fontsize=TEXT)
+        name_ticks(panels[i, 0], "y", range(len(methods)), methods, fontsize=TEXT)
         panels[i, 0].set_ylim(len(methods) - 0.4, -0.6)
         panels[i, 1].tick_params(left=False)
     handles = [
@@ -320,7 +313,7 @@ def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str 
         ),
     ]  # fmt: skip
     head(figure, theme, handles, title=title)
-    belts = f"simulated: {table.belts:,} belts; dissertation: one belt, 24 onions"
+    belts = f"simulated: {counted(table.belts, 'belt')}; dissertation: one belt, 24 onions"
     foot(figure, theme, f"bars: {table.level:.0%} intervals; {belts}")
     return figure
 

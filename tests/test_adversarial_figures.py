@@ -29,7 +29,6 @@ from i2rl.analysis.adversarial_report import (
 )
 from i2rl.analysis.adversarial_results import (
     CLEAN,
-    METHODS,
     NOISY,
     ROBUST,
     SSRR,
@@ -42,7 +41,7 @@ from i2rl.analysis.adversarial_results import (
     store_results,
 )
 from i2rl.analysis.noisy_examples import Strip
-from i2rl.analysis.style import DARK, LIGHT
+from i2rl.analysis.style import DARK, LIGHT, method_styles
 from i2rl.domains.locomotion import locomotion
 from i2rl.models import Demonstration, StorageError
 
@@ -119,7 +118,7 @@ def test_learning_shows_each_methods_mean(hopper, patrol, theme):
             line = _lines(panel)[name]
             np.testing.assert_array_equal(line.get_xdata(), PAIRS)
             np.testing.assert_allclose(line.get_ydata(), getattr(hopper.methods[name], measure).mean(0))
-            assert to_hex(line.get_color()) == theme.series[METHODS.index(name)]
+            assert to_hex(line.get_color()) == to_hex(method_styles(theme, [name])[name]["color"])
     assert set(_lines(returns)["expert"].get_ydata()) == {2900.0}
     assert {t.get_text() for t in figure.legends[0].get_texts()} == {*LEVELS, "expert"}
     (only,) = learning_plot(patrol, theme).axes
@@ -150,6 +149,35 @@ def test_an_interval_without_an_end_is_shown_to_go_on(patrol):
     (axes,) = recovery_plot([unclear], LIGHT).axes
     assert any(line.get_marker() in ("<", ">") for line in axes.lines)
     assert "not known" in recovery_table(unclear).rows[-1][1]
+
+
+def test_an_unknown_share_is_no_point_on_the_axis(patrol):
+    level = {CLEAN: 0.8, NOISY: 0.9, ROBUST: 0.85}
+    methods = {m: MethodResult(PAIRS, accuracy=np.full((1, 8), x)) for m, x in level.items()}
+    unclear = patrol._replace(methods=methods, seeds=1)
+    assert unclear.recovery().share == -math.inf
+    figure = recovery_plot([unclear], LIGHT)
+    (axes,) = figure.axes
+    assert "not known" in axes.texts[0].get_text()
+    assert not [line for line in axes.lines if line.get_marker() not in (None, "None", "")]
+    assert [len(line.get_xdata()) for line in axes.lines] == [2]  # the target alone
+    assert figure.get_supxlabel() == "one seed a row, no interval"
+
+
+def test_one_seed_has_no_interval_of_its_share(patrol):
+    methods = {m: r._replace(accuracy=r.accuracy[:1]) for m, r in patrol.methods.items()}
+    rows = recovery_table(patrol._replace(methods=methods, seeds=1)).rows
+    assert rows[-1][1].endswith("(one seed, no interval)")
+
+
+def test_a_constant_reward_has_no_correlation_in_the_figure(hopper):
+    flat = hopper.scatters[CLEAN]
+    for part in ("steps", "trajectories"):
+        none = getattr(flat.correlation, part)._replace(pearson=math.nan)
+        flat = flat._replace(correlation=flat.correlation._replace(**{part: none}))
+    (axes,) = scatter_plot({CLEAN: flat}, LIGHT).axes
+    assert "nan" not in axes.get_title(loc="left")
+    assert axes.get_title(loc="left").count("not defined") == 2
 
 
 def test_scatter_shows_the_trajectories_and_tells_the_correlation(hopper):
@@ -259,9 +287,15 @@ def test_recovery_is_told_as_the_dissertation_computes_it(hopper, patrol):
 def test_breaches_and_errors_are_told_beside_the_dissertations(patrol):
     breaches = {row[0]: row for row in breach_table(patrol).rows}
     assert [breaches[m][-1] for m in (CLEAN, NOISY, ROBUST)] == ["-", "45 to 53", "59 to 66"]
-    errors = {row[0]: row for row in ile_table(patrol).rows}
+    errors = {row[0]: row for row in ile_table(patrol._replace(domain="onion")).rows}
     assert errors[f"{NOISY}: dissertation"][1:4] == ("0.889", "0.625", "0.297")
     assert errors[NOISY][3] == "0.222 (0.222 to 0.222)"
+
+
+def test_table_7_5_is_told_of_its_own_task_alone(patrol):
+    table = ile_table(patrol)
+    assert [row[0] for row in table.rows] == [CLEAN, NOISY, ROBUST]
+    assert "7.5" not in table.caption
 
 
 def test_correlations_are_told_beside_table_7_4(hopper):

@@ -54,6 +54,64 @@ def test_every_figure_is_drawn_in_the_themes_colours(posterior, draw, theme):
     assert any(axes.get_xlabel() or axes.get_ylabel() for axes in figure.axes) or figure.texts
 
 
+BINS = 10
+
+
+@pytest.fixture(scope="module")
+def stuck():
+    """Four chains: one sits apart in a weight, another never moves in the next, nothing moves in the last."""
+    weights = np.random.default_rng(0).normal(size=(4, 60, 4))
+    weights[2, :, 1] = 3 + 0.01 * weights[2, :, 1]
+    weights[3, :, 2] = 1.7
+    weights[:, :, 3] = 0.5
+    return az.from_dict(
+        posterior={"weights": weights}, coords={"feature": ["well", "stuck [m/s]", "$still$", "_frozen"]},
+        dims={"weights": ["feature"]},
+    )  # fmt: skip
+
+
+def test_ranks_show_all_of_the_bars_of_a_stuck_chain(stuck):
+    figure = rank_plot(stuck, bins=BINS)
+    for axes, (name, weights) in zip(
+        figure.axes, stuck.posterior["weights"].groupby("feature"), strict=False
+    ):
+        del name, weights
+        bars = np.concatenate(
+            [patch.get_data().values for patch in axes.patches if hasattr(patch, "get_data")]
+        )
+        assert axes.get_ylim()[0] == 0
+        assert axes.get_ylim()[1] >= bars.max()
+    # Sixty draws of one chain in the last bins of a panel whose first neighbours have six.
+    highest = [axes.get_ylim()[1] for axes in figure.axes[:4]]
+    assert highest[1] > 1.5 * highest[0]
+    assert highest[2] > 60
+
+
+def test_traces_show_a_chain_that_never_moves(stuck):
+    figure = trace_plot(stuck)
+    left = figure.axes[4]
+    assert any(np.allclose(line.get_xdata(), 1.7) for line in left.get_lines())
+    for axes in figure.axes[::2]:  # one spike does not press the other chains' densities down
+        tops = [line.get_ydata().max() for line in axes.get_lines()]
+        assert min(tops) == pytest.approx(1)
+
+
+def test_convergence_marks_what_is_stuck_and_clips_nothing(stuck):
+    figure = convergence_plot(stuck)
+    left, right = figure.axes
+    told = [text.get_text() for axes in (left, right) for text in axes.texts]
+    assert told == ["stuck: every draw is the same"] * 2
+    assert [t.get_text() for t in left.get_yticklabels()][1:3] == ["stuck [m/s]", r"\$still\$"]
+    rhat = next(line for line in left.get_lines() if len(line.get_xdata()) == 4).get_xdata()
+    assert np.isnan(rhat).tolist() == [False, False, False, True]
+    assert rhat[1] > 1.3
+    low, high = left.get_xlim()
+    assert low < np.nanmin(rhat)
+    assert np.nanmax(rhat) < high
+    for line in right.get_lines()[:2]:
+        assert np.isnan(line.get_xdata()[3])
+
+
 def test_the_forest_shows_each_weights_median(posterior):
     axes = forest_plot(posterior).axes[0]
     shown = np.concatenate([line.get_xdata() for line in axes.get_lines()])

@@ -1,6 +1,5 @@
 from __future__ import annotations
 
-import re
 import struct
 import warnings
 from functools import cache
@@ -17,9 +16,16 @@ from matplotlib.collections import PolyCollection, QuadMesh
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 
-from i2rl.analysis import figures, maps, style
+from i2rl.analysis import (
+    adversarial_results,
+    figures,
+    maps,
+    noisy_study,
+    patrol_study,
+    sorting_study,
+    style,
+)
 from i2rl.analysis.metrics import greedy_policy
-from i2rl.analysis.report import Picture, Section, Table, write_report
 from i2rl.domains.patrol import RIGHT, STOP, demonstrate, instance
 from i2rl.inference.smoothing import evidence_of, smooth_all
 from i2rl.models import reward_of, soft_plan
@@ -267,6 +273,121 @@ def test_themes_are_legible(theme: style.Theme) -> None:
     assert abs(np.sign(np.diff(steps)).sum()) == 29
 
 
+# Machado, Oliveira and Fernandes (2009): sight without one kind of cones, in linear sRGB.
+SIGHTS = {
+    "all": np.eye(3),
+    "no red": [
+        [0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216],
+        [-0.003882, -0.048116, 1.051998],
+    ],
+    "no green": [
+        [0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413],
+        [-0.011820, 0.042940, 0.968881],
+    ],
+    "no blue": [
+        [1.255528, -0.076749, -0.178779], [-0.078411, 0.930809, 0.147602],
+        [0.004733, 0.691367, 0.303900],
+    ],
+}  # fmt: skip
+
+
+def oklab(linear: np.ndarray) -> np.ndarray:
+    cones = [[0.4122214708, 0.5363325363, 0.0514459929], [0.2119034982, 0.6806995451, 0.1073969566],
+             [0.0883024619, 0.2817188376, 0.6299787005]]  # fmt: skip
+    axes = [[0.2104542553, 0.7936177850, -0.0040720468], [1.9779984951, -2.4285922050, 0.4505937099],
+            [0.0259040371, 0.7827717662, -0.8086757660]]  # fmt: skip
+    return np.cbrt(np.clip(linear, 0, 1) @ np.transpose(cones)) @ np.transpose(axes)
+
+
+@pytest.mark.parametrize("sight", SIGHTS)
+@pytest.mark.parametrize("theme", style.THEMES, ids=lambda theme: theme.name)
+def test_every_two_colours_of_methods_are_told_apart(theme: style.Theme, sight: str) -> None:
+    rgb = np.array([to_rgb(colour) for colour in theme.series])
+    linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+    seen = oklab(np.clip(linear @ np.transpose(SIGHTS[sight]), 0, 1))
+    apart = np.linalg.norm(seen[:, None] - seen[None], axis=-1)[np.triu_indices(len(seen), 1)]
+    assert apart.min() > 0.1
+
+
+# Methods that share a panel.
+TOGETHER = [
+    [patrol_study.ONLINE, patrol_study.FORGETFUL, patrol_study.BATCH, "batch LME, again after every session"],
+    ["Jin et al., table over states", "Jin et al., features", "DARKO, goals", "DARKO, windows of 5",
+     "ME-I2RL, features", "LME-I2RL, seen"],
+    list(sorting_study.METHODS.values()),
+    [noisy_study.PLAIN, noisy_study.AVERAGED, noisy_study.STEPWISE, noisy_study.BARE],
+    [noisy_study.ORACLE, noisy_study.OBSERVED, noisy_study.FAIR, noisy_study.CODED, noisy_study.ALL],
+    [noisy_study.PLAIN, noisy_study.AVERAGED, noisy_study.STEPWISE, noisy_study.FAIR, noisy_study.KNOWN,
+     noisy_study.CLEAR, noisy_study.ROBUST, noisy_study.MLIRL],
+    [noisy_study.HIDDEN, noisy_study.BOTH],
+    list(adversarial_results.METHODS),
+    ["AIRL, clean input", "AIRL, noisy input", "robust-AIRL", "robust-AIRL, sensor learned", "LME-I2RL"],
+    ["AIRL, noisy input", "robust-AIRL", "AIRL, noisy input, memory", "robust-AIRL, memory"],
+    ["i2rl", "i2rl, by level", "uniform", "frequencies", "frequencies of choices", "given entry",
+     "level and entry", "Markov"],
+    ["BIRL", "MaxEnt"],
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("names", TOGETHER, ids=lambda names: names[0])
+def test_methods_of_a_panel_differ_in_colour_in_dashes_and_in_marker(names: list[str]) -> None:
+    assert {style._SAME.get(name, name) for name in names} <= set(style.METHOD_LOOKS)
+    looks = style.method_styles(style.LIGHT, names)
+    for part in ("color", "linestyle", "marker"):
+        assert len({look[part] for look in looks.values()}) == len(names)
+
+
+def test_no_two_methods_look_the_same_and_none_changes_its_look() -> None:
+    assert len(set(style.METHOD_LOOKS.values())) == len(style.METHOD_LOOKS)
+    for names in TOGETHER:
+        for name in names:
+            alone = style.method_styles(style.DARK, [name])[name]
+            assert style.method_styles(style.DARK, [*names, "another"])[name] == alone
+
+
+def test_methods_of_others_take_colours_that_are_left() -> None:
+    looks = style.method_styles(style.LIGHT, ["mine", "LME-I2RL", "yours"])
+    assert len({look["color"] for look in looks.values()}) == 3
+
+
+@pytest.mark.parametrize("theme", style.THEMES, ids=lambda theme: theme.name)
+def test_signed_shades_put_zero_in_the_middle_and_grow_to_both_sides(theme: style.Theme) -> None:
+    shades = theme.signed_shades(np.array([-0.5, 2.0, np.nan]))
+    assert (shades.norm.vmin, shades.norm.vmax) == (-2, 2)
+    np.testing.assert_allclose(shades.to_rgba(0.0)[:3], to_rgb(theme.signed[2]), atol=0.01)
+    steps = [luminance(shades.to_rgba(x)[:3]) for x in np.linspace(-2, 2, 41)]
+    away = np.abs(np.array(steps) - steps[20])
+    assert (np.diff(away[:21]) <= 1e-9).all()
+    assert (np.diff(away[20:]) >= -1e-9).all()
+    assert theme.signed_shades(np.zeros(3)).norm.vmax > 0
+
+
+NAMES = ["speed [m/s]", "cost $x_1$ of $x_2$", "_hidden", "\x1b[31mred"]
+
+
+def shown_texts(figure: Figure) -> list[str]:
+    told = []
+    for text in drawn(figure).findobj(mpl.text.Text):
+        content, formula = text._preprocess_math(text.get_text())
+        assert not formula, content
+        told.append(content.removeprefix("\u2060"))
+    return told
+
+
+def test_names_of_methods_and_features_are_drawn_as_they_are() -> None:
+    curves = [curve(name) for name in NAMES]
+    rates = [figures.SuccessRate(name, 1, 1, 3) for name in NAMES]
+    for figure in (
+        figures.learning_curves(curves, title="a $b$ c"),
+        figures.success_rates(rates),
+        figures.weights_plot(NAMES, np.ones(4), np.ones((2, 4))),
+    ):
+        told = shown_texts(figure)
+        for name in NAMES[:3]:
+            assert name in told
+        assert "\\x1b[31mred" in told
+
+
 def test_drawing_leaves_matplotlibs_settings_alone() -> None:
     before = dict(mpl.rcParams)
     drawn(figures.learning_curves([curve("one")], theme=style.DARK))
@@ -288,39 +409,6 @@ def test_both_themes_are_saved_as_small_png_files(tmp_path: Path) -> None:
         assert min(struct.unpack(">II", content[16:24])) > 600
         assert len(content) < 200_000
     assert paths[0].read_bytes() != paths[1].read_bytes()
-
-
-def test_a_report_is_one_file_that_needs_no_network(tmp_path: Path) -> None:
-    light, dark = style.save_themes(
-        lambda theme: figures.weights_plot(["a", "b"], np.ones(2), np.ones(2), theme=theme),
-        tmp_path,
-        "weights",
-    )
-    picture = Picture(light, dark, "Weights <learned>", 'Two "dots"')
-    table = Table(["method", "LBA"], [["a & b", 0.97], ["c", 1]], "Accuracy")
-    path = write_report(
-        tmp_path / "out", [Section("Results", "First.\n\nSecond <b>.", [table], [picture])], "Patrol"
-    )
-    light.unlink()
-    dark.unlink()
-    page = path.read_text(encoding="utf-8")
-    assert path.name == "index.html"
-    assert not re.search(r"(?:src|srcset|href)=\"(?!data:)", page)
-    assert page.count("data:image/png;base64,") == 2
-    assert "prefers-color-scheme: dark" in page
-    assert "<p>First.</p>" in page
-    assert "Second &lt;b&gt;." in page
-    assert "Weights &lt;learned&gt;" in page
-    assert 'alt="Two &quot;dots&quot;"' in page
-    assert '<td>a &amp; b</td><td class="number">0.97</td>' in page
-
-
-def test_a_report_refuses_ragged_tables_and_missing_pictures_and_writes_nothing(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match="section 'S': row 1 has 1 cells under 2 headings"):
-        write_report(tmp_path, [Section("S", tables=[Table(["a", "b"], [[1, 2], [3]])])])
-    with pytest.raises(FileNotFoundError):
-        write_report(tmp_path, [Section("S", pictures=[Picture("no.png", "no.png", "", "")])])
-    assert not (tmp_path / "index.html").exists()
 
 
 def test_a_demonstration_seen_throughout_leaves_no_doubt() -> None:

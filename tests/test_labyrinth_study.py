@@ -2,27 +2,30 @@
 
 from __future__ import annotations
 
+import io
 import json
 
 import jax
 import numpy as np
 import pytest
+from rich.console import Console
 
 from i2rl.analysis.labyrinth import (
     bits_per_decision,
     predict_with_learner,
     predict_with_table,
     predict_with_tables,
-    report,
+    print_tables,
     study,
     summary,
     tables,
+    write,
 )
-from i2rl.analysis.labyrinth_figures import maze_layout, values_by_node
+from i2rl.analysis.labyrinth_figures import value_on_maze, values_by_node
+from i2rl.analysis.style import LIGHT
 from i2rl.domains.labyrinth import (
     FIRST_END,
     HOME,
-    N_NODES,
     WATER_PORT,
     Bout,
     demonstration_of,
@@ -187,31 +190,46 @@ def test_an_empty_recording_is_refused():
         study([])
 
 
-def test_the_report_holds_figures_in_both_themes_and_every_number(result, tmp_path):
-    paths = report(result, tmp_path / "new")
-    names = ["bits-light.png", "bits-dark.png", "value-light.png", "value-dark.png", "study.json"]
-    assert [p.name for p in paths] == names
-    assert all(p.read_bytes().startswith(b"\x89PNG") for p in paths[:-1])
-    content = json.loads(paths[-1].read_text())
+def test_the_page_holds_pictures_in_both_themes_and_every_number(result, tmp_path):
+    page = write(result, tmp_path / "new").read_text(encoding="utf-8")
+    for name in ("bits-light.png", "bits-dark.png", "value-light.png", "value-dark.png"):
+        assert (tmp_path / "new" / name).read_bytes().startswith(b"\x89PNG")
+    assert page.count("<picture>") == 2
+    assert "i2rl learned a reward that predicts each new bout" in page
+    content = json.loads((tmp_path / "new" / "results.json").read_text())
     assert content == json.loads(json.dumps(summary(result)))
     methods = content["views"]["whole maze"]["methods"]
     assert methods["i2rl"]["bits_per_decision"]["estimate"] == pytest.approx(score(result, "i2rl"))
     assert sum(methods["Markov"]["bits_of_each_bout"]) == pytest.approx(
         score(result, "Markov") * content["decisions"]
     )
-    assert [t.row_count for t in tables(result)] == [8, 7]
+    assert [len(t.rows) for t in tables(result)] == [8, 7]
+    console = Console(file=io.StringIO(), width=140)
+    print_tables(result, console)
+    assert "a simulated mouse" in console.file.getvalue()
 
 
-def test_the_maze_is_drawn_without_two_nodes_in_one_place_and_children_beside_their_parent():
-    position = maze_layout()
-    assert len({tuple(p) for p in position}) == N_NODES + 1
-    for node in range(1, N_NODES):
-        assert (position[node] == position[parent_of(node)]).sum() == 1
-    assert {tuple(p) for p in position[FIRST_END:N_NODES]} == {
-        (x, y) for x in range(-7, 8, 2) for y in range(-7, 8, 2)
-    }
-    left_of_heading = position[1] - position[0]
-    assert left_of_heading[1] > 0
+def test_weights_come_with_intervals_that_hold_most_of_the_true_ones(result):
+    # Weights on places that a mouse hardly sees are the prior's; those of its habits are the data's.
+    content = summary(result)["views"]["whole maze"]["intervals"]
+    found = {row["feature"]: row["95 % interval"] for row in content}
+    truth = dict(zip(MAZE.mdp.feature_names, thirsty_weights(), strict=True))
+    assert all(found[name][0] < found[name][1] for name in truth)
+    inside = [found[name][0] <= weight <= found[name][1] for name, weight in truth.items()]
+    assert np.mean(inside) > 0.9
+    assert found["turns round"][1] < 0
+    assert summary(result)["views"]["left half hidden"]["intervals"] is None
+
+
+def test_signed_values_are_drawn_on_one_scale_with_zero_marked_in_the_middle(result):
+    figure = value_on_maze(result, LIGHT)
+    bar = next(axes for axes in figure.axes if axes.get_ylabel().startswith("learned value"))
+    low, high = bar.get_ylim()
+    assert low == -high
+    assert any(np.allclose(line.get_ydata(), 0) for line in bar.get_lines())
+    # Home is where the environment draws it: below the maze.
+    home = next(text for text in figure.axes[0].texts if text.get_text() == "home")
+    assert home.xy[1] == min(text.xy[1] for text in figure.axes[0].texts)
 
 
 def test_the_value_drawn_at_the_water_port_holds_the_reward_of_reaching_it():

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 
+from ..text import number
+
 DEFAULT_FOLDER = Path("build/bench")
 
 
@@ -45,11 +47,8 @@ def publish(name: str, results: Mapping[str, Any], path: Path | None = None) -> 
 def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]]) -> None:
     """Print rows as a table; numbers to four significant digits."""
     from rich.console import Console
-    from rich.table import Table
 
-    table = Table(title=title)
-    for i, column in enumerate(columns):
-        table.add_column(column, justify="left" if i == 0 else "right")
-    for row in rows:
-        table.add_row(*(f"{x:.4g}" if isinstance(x, float) else str(x) for x in row))
-    Console(width=140).print(table)
+    from ..page import Table, print_tables
+
+    cells = [[number(x, 4) if isinstance(x, float) else str(x) for x in row] for row in rows]
+    print_tables([Table(columns, cells)], Console(width=140), title)
