@@ -22,6 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ..models.arguments import as_key
 from ..models.extras import required
 from ..models.networks import DTYPE, ActionSpace, Policy, ShapedReward
 from ..models.sensing import Recording, require_recording
@@ -38,7 +39,7 @@ from .discriminator import (
 )
 from .discriminator_training import Objective, discriminator_updates
 from .rollouts import finished_returns
-from .session import Learner, as_key
+from .session import Learner
 from .truth_sampling import FaceValue, Truth, look
 
 if TYPE_CHECKING:

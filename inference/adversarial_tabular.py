@@ -24,6 +24,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ..models.arguments import as_key
 from ..models.demonstration import Demonstration, DemonstrationError
 from ..models.evidence import Imperfection, Sensor, checked_demonstration, fitting_sensor, require_possible
 from ..models.extras import required
@@ -32,7 +33,7 @@ from ..models.networks import DTYPE
 from ..models.planning import require_discounted
 from .confusion_fit import ConfusionNoise, ConfusionStatistic, confusion_counts, fitted_confusions
 from .lme import _digest
-from .session import Learner, as_key, in_plain_numbers
+from .session import Learner, in_plain_numbers
 from .smoothing import evidence_of
 from .statistic import blend
 from .tabular_discriminator import (

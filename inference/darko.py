@@ -32,11 +32,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ..models.arguments import as_key
 from ..models.demonstration import PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
 from ..models.evidence import Sensor, checked_demonstration, require_possible
 from ..models.mdp import Labels, TabularMDP
 from ..models.planning import features_to_go, require_discounted, reward_of, soft_plan
-from .session import Learner, Report, as_key
+from .session import Learner, Report
 from .smoothing import Evidence, evidence_of, smooth_all
 from .statistic import FEATURES, FeatureStatistic, complete
 

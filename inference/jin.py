@@ -26,11 +26,12 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ..models.arguments import as_key
 from ..models.demonstration import SEEN, UNKNOWN, Demonstration, DemonstrationError
 from ..models.evidence import checked_demonstration
 from ..models.mdp import Labels, TabularMDP
 from ..models.planning import deterministic_policy, hard_plan, occupancy, require_discounted, reward_of
-from .session import Learner, Report, as_key
+from .session import Learner, Report
 
 
 class JinState(NamedTuple):

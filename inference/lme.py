@@ -29,7 +29,7 @@ from ..models.planning import SoftPlan, require_discounted, reward_of, soft_plan
 from .maxent import Solution, WarmStart, exponentiated_gradient, fit_counts, solve_dual
 from .maxent_constraints import FeatureTarget
 from .schedule import Schedule, described, program_slack, require_slack, require_slack_in
-from .session import Learner, Report, as_key
+from .session import Learner, Report
 from .smoothing import Evidence, blocked_posterior, evidence_of, gibbs_posterior, smooth_all
 from .statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
 

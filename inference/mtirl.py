@@ -37,7 +37,7 @@ from .mixture_fit import (
     nothing_kept,
 )
 from .mixture_search import Search, search
-from .session import Learner, as_key, in_plain_numbers
+from .session import Learner, in_plain_numbers
 
 DEFAULT_WAYS = 4
 DEFAULT_RESTARTS = 4

@@ -25,6 +25,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
+from ..models.arguments import as_key
 from ..models.environment import Environment, HostEnvironment, Rollout
 from ..models.extras import required
 from ..models.networks import DTYPE, MLP, ActionSpace, Policy, ShapedReward
@@ -42,7 +43,7 @@ from .discriminator import Discriminator, Losses, Transitions, cross_entropy
 from .discriminator_training import Objective, discriminator_updates
 from .ppo import PPO, PPOState
 from .rollouts import Running, finished_returns, roll_out
-from .session import Learner, as_key
+from .session import Learner
 from .truth_sampling import reported_steps, within_bounds
 
 if TYPE_CHECKING:

@@ -22,6 +22,7 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 
+from ..models.arguments import as_key
 from ..models.demonstration import SEEN, Demonstration, DemonstrationError
 from ..models.evidence import (
     FeatureNoise,
@@ -50,7 +51,7 @@ from .perception import (
 from .programs import host_solver
 from .reports import report_classes, report_log_evidence
 from .schedule import Schedule, described, require_slack_in
-from .session import Learner, as_key, in_plain_numbers
+from .session import Learner, in_plain_numbers
 from .smoothing import Evidence, smooth_all
 from .statistic import blend, complete
 

@@ -20,6 +20,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
+from ..models.arguments import as_key
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import deterministic_policy, hard_plan, policy_values, reward_of
@@ -103,19 +104,6 @@ class Learner(NamedTuple):
             [self.mdp.fingerprint(), self.name, dict(self.configuration)], sort_keys=True, default=str
         )
         return hashlib.sha256(content.encode()).hexdigest()
-
-
-def as_key(key: Any) -> Array:
-    """Return one typed random key; a legacy one (``jax.random.PRNGKey``) becomes the key that draws the same.
-
-    Raises ``TypeError`` for what is not one random key.
-    """
-    if isinstance(key, jax.Array | np.ndarray):
-        if jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0:
-            return jnp.asarray(key)
-        if key.dtype == np.uint32 and key.ndim == 1:
-            return jax.random.wrap_key_data(jnp.asarray(key))
-    raise TypeError(f"`key` must be one random key, such as jax.random.key(0); got {shortened(key)}")
 
 
 class Fleet(NamedTuple):

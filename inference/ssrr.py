@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import isotonic_regression, least_squares
 
+from ..models.arguments import as_key
 from ..models.environment import Environment, HostEnvironment, Rollout
 from ..models.networks import DTYPE, ShapedReward
 from ..models.sensing import Recording
@@ -28,7 +29,7 @@ from .discriminator import Discriminator
 from .noisy_airl import NoisyRollout, NoisyTraining, noisy_airl, roll_out_noisily
 from .ppo import PPO, PPOState
 from .rollouts import begin, finished_returns
-from .session import Learner, as_key
+from .session import Learner
 from .snippet_regression import Ranked, Regression, SSRRReward, snippet_regression
 from .truth_sampling import reported_steps
 

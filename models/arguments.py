@@ -10,6 +10,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array
 
+from .text import shortened
+
 Fields = TypeVar("Fields", bound=type)
 
 
@@ -45,28 +47,26 @@ def is_traced(given: Any) -> bool:
 
 
 def as_key(key: Any) -> Array:
-    """Take a JAX random key, or make one of a seed.
+    """Take one JAX random key, or make one of a seed.
 
-    Typed keys and legacy ones (``uint32 [2]``) are returned as they are. Raises ``TypeError`` otherwise.
+    A legacy key (``jax.random.PRNGKey``) becomes the typed key that draws the same. Raises ``TypeError`` for
+    what is neither.
 
     Examples
     --------
-    >>> as_key(7) == jax.random.key(7)
+    >>> as_key(7) == as_key(jax.random.PRNGKey(7)) == jax.random.key(7)
     Array(True, dtype=bool)
     """
     if isinstance(key, Tracer):
         return key
     if isinstance(key, int | np.integer) and not isinstance(key, bool):
         return jax.random.key(int(key))
-    if isinstance(key, jax.Array) and (
-        jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) or key.dtype == jnp.uint32
-    ):
-        return key
-    if isinstance(key, np.ndarray) and key.dtype == np.uint32 and key.shape[-1:] == (2,):
-        return jnp.asarray(key)
-    raise TypeError(
-        f"key must be a JAX random key such as jax.random.key(0), or a seed; got {described(key)}"
-    )
+    if isinstance(key, jax.Array | np.ndarray):
+        if jax.dtypes.issubdtype(key.dtype, jax.dtypes.prng_key) and key.ndim == 0:
+            return jnp.asarray(key)
+        if key.dtype == np.uint32 and key.ndim == 1:
+            return jax.random.wrap_key_data(jnp.asarray(key))
+    raise TypeError(f"key must be one random key such as jax.random.key(0), or a seed; got {described(key)}")
 
 
 def rebuilt_unchecked(cls: Fields) -> Fields:
@@ -104,5 +104,4 @@ def described(given: Any) -> str:
     shape = getattr(given, "shape", None)
     if shape is not None and hasattr(given, "dtype"):
         return f"{type(given).__name__} of {given.dtype} with shape {list(shape)}"
-    text = repr(given)
-    return f"{text if len(text) <= 60 else text[:57] + '...'} ({type(given).__name__})"
+    return f"{shortened(given, 60)} ({type(given).__name__})"
