@@ -49,8 +49,12 @@ def followed(path: str, say: Callable[[str], None], poll_seconds: float = 0.2) -
 
     A file that is replaced (rotated) is read to its end, and then the new one from its start. A file that is
     cut off or written anew is read from its start. Both are said; a line that was incomplete then ends.
+    Raises ``OSError``.
     """
-    file = open(path, "rb", buffering=0)  # noqa: SIM115 (read to the end of the process)
+    return _followed(open(path, "rb", buffering=0), path, say, poll_seconds)
+
+
+def _followed(file: FileIO, path: str, say: Callable[[str], None], poll_seconds: float) -> Iterator[bytes]:
     tail, leaving = b"", False
     while True:
         change = ""

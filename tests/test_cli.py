@@ -418,6 +418,8 @@ def test_mistakes_in_the_options_are_told_in_one_line(house, monkeypatch, change
     np.savez(house / "poor.npz", successors=np.zeros((2, 1, 1), int))
     before = sorted(os.listdir(house))
     assert re.search(message, refused(*options(house, **changes)))
+    if "demos" in changes:
+        assert re.search(message, refused(*options(house, **changes), "--follow"))
     assert sorted(os.listdir(house)) == before  # a refused command leaves nothing behind
 
 
