@@ -4,6 +4,9 @@ Soft (maximum causal entropy; Ziebart 2010) and hard planning, over an infinite 
 horizon; values, occupancies and feature expectations of a policy. Soft plans and everything computed of a
 policy are differentiable in the reward, the transition probabilities and the discount, over an infinite
 horizon by the implicit function theorem: no unrolling.
+
+A reward or a policy that is not a number is refused with its state and action where there are numbers to look
+at, and makes every result NaN where JAX traces it.
 """
 
 from __future__ import annotations
@@ -18,8 +21,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from .arguments import as_key
-from .mdp import TabularMDP
+from .arguments import as_key, is_traced
+from .mdp import TabularMDP, _PairNames
 
 # Up to here a dense [S, S] factorisation beats Krylov iterations (0.1 ms at 124 states, 12 ms at 1024).
 DIRECT_LIMIT = 1500
@@ -80,6 +83,16 @@ def require_discounted(mdp: TabularMDP) -> None:
         )
 
 
+def _require_numbers(mdp: TabularMDP, what: str, table: Any) -> None:
+    """Raise ``ValueError`` naming the first available pair whose entry of a table ``[S, A]`` is NaN."""
+    if is_traced(table) or is_traced(mdp.available):
+        return
+    wrong = np.isnan(np.asarray(table)) & np.asarray(mdp.available)
+    if wrong.any():
+        *_, s, a = np.argwhere(wrong)[0]
+        raise ValueError(f"the {what} of {_PairNames(mdp.labels).pair(s, a)} is nan, not a number")
+
+
 def soft_plan(
     mdp: TabularMDP, reward: Float[Array, "S A"], start: Float[Array, " S"] | None = None
 ) -> SoftPlan:
@@ -87,9 +100,11 @@ def soft_plan(
 
     ``start [S]`` warm-starts the values. Newton's method (soft policy iteration), with direct solves up to
     ``DIRECT_LIMIT`` states and Krylov solves beyond; to about 1e-12 of the values' scale, or as well as
-    rounding allows where the discount is above 0.99. Raises ``ValueError`` for discount 1.
+    rounding allows where the discount is above 0.99. Raises ``ValueError`` for discount 1 and a
+    reward of NaN; where the reward is traced, NaN makes the whole plan NaN.
     """
     require_discounted(mdp)
+    _require_numbers(mdp, "reward", reward)
     start = jnp.zeros(mdp.n_states) if start is None else jnp.asarray(start, float)
     values = _soft_values(mdp, jnp.asarray(reward), lax.stop_gradient(start))
     q = action_values(mdp, reward, values)
@@ -127,9 +142,11 @@ def hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: float = 1
     """Solve the Bellman optimality equations; actions within ``tolerance`` of the best count as optimal.
 
     ``tolerance`` is relative to the spread of the values. Policy iteration, with direct solves up to
-    ``DIRECT_LIMIT`` states and Krylov solves beyond. Raises ``ValueError`` for discount 1.
+    ``DIRECT_LIMIT`` states and Krylov solves beyond. Raises ``ValueError`` for discount 1 and a reward of
+    NaN; where the reward is traced, NaN makes all values NaN and no action optimal.
     """
     require_discounted(mdp)
+    _require_numbers(mdp, "reward", reward)
 
     def backup(values: Float[Array, " S"]) -> Float[Array, " S"]:
         return jnp.max(action_values(mdp, reward, values), axis=1)
@@ -154,8 +171,9 @@ def greedy_actions(q: Float[Array, "S A"], tolerance: float = 1e-9) -> Bool[Arra
 
 
 def deterministic_policy(optimal: Bool[Array, "S A"]) -> Float[Array, "S A"]:
-    """The policy that takes the first optimal action of each state with certainty."""
-    return jax.nn.one_hot(jnp.argmax(optimal, axis=1), optimal.shape[1])
+    """Policy that takes the first optimal action of each state with certainty; NaN where none is optimal."""
+    first = jax.nn.one_hot(jnp.argmax(optimal, axis=1), optimal.shape[1])
+    return jnp.where(jnp.any(optimal, axis=1, keepdims=True), first, jnp.nan)
 
 
 def _precision(discount: Float[Array, ""]) -> Float[Array, ""]:
@@ -188,11 +206,17 @@ def _policy_iteration(
         rounding = (left < 1e-13 * scale) & (left > before / 2)
         return (left > _precision(mdp.discount) * scale) & ~rounding & (step < _MAX_STEPS)
 
-    return lax.while_loop(unfinished, improve, (start, *residual(start), jnp.array(jnp.inf), 0))[0]
+    values, _, gap, *_ = lax.while_loop(unfinished, improve, (start, *residual(start), jnp.array(jnp.inf), 0))
+    return _if_numbers(gap, values)
 
 
 def _largest(x: Float[Array, " S"]) -> Float[Array, ""]:
     return jnp.max(jnp.abs(x))
+
+
+def _if_numbers(gap: Float[Array, " S"], solution: Float[Array, " S"]) -> Float[Array, " S"]:
+    # No comparison with NaN holds, so that an iteration ends at once and where it began.
+    return jnp.where(jnp.isnan(_largest(gap)), jnp.nan, solution)
 
 
 def _fixed_point(
@@ -238,7 +262,8 @@ def _fixed_point(
         x, gap, shrinking, count = carry
         return (size(gap) > _precision(discount) * (floor + size(x))) & shrinking & (count < _MAX_STEPS)
 
-    return lax.while_loop(unfinished, step, (start, backup(start) - start, jnp.array(True), 0))[0]
+    x, gap, *_ = lax.while_loop(unfinished, step, (start, backup(start) - start, jnp.array(True), 0))
+    return _if_numbers(gap, x)
 
 
 def solve_values(
@@ -347,11 +372,14 @@ def policy_values(
 ) -> Float[Array, " S"]:
     """Exact discounted values ``V^pi(s)`` of a policy under a reward."""
     require_discounted(mdp)
+    _require_numbers(mdp, "reward", reward)
+    _require_numbers(mdp, "policy", policy)
     return solve_values(mdp, policy, jnp.sum(policy * jnp.where(mdp.available, reward, 0.0), axis=1))
 
 
 def features_to_go(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array, "S K"]:
     """``mu(s)``: expected discounted features collected from each state on."""
+    _require_numbers(mdp, "policy", policy)
     return solve_values(mdp, policy, jnp.einsum("sa,sak->sk", policy, mdp.features))
 
 
@@ -359,6 +387,7 @@ def occupancy(
     mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, "S A"]:
     """Discounted occupancy ``x(s, a) = sum_t gamma^t P(s_t = s, a_t = a)``; sums to ``1 / (1 - gamma)``."""
+    _require_numbers(mdp, "policy", policy)
     initial = mdp.initial if initial is None else initial
     # The transpose of the linear map above; differentiating it gives the transposed solve.
     _, pull = jax.vjp(lambda rate: solve_values(mdp, policy, rate), jnp.zeros(mdp.n_states))
@@ -398,6 +427,7 @@ class FinitePlan(NamedTuple):
 
 def finite_soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int) -> FinitePlan:
     """Soft plan over ``horizon`` steps by one backward sweep; any discount in (0, 1]."""
+    _require_numbers(mdp, "reward", reward)
 
     def back(values: Float[Array, " S"], _: None) -> tuple:
         q = action_values(mdp, reward, values)
@@ -410,6 +440,7 @@ def finite_soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int)
 
 def finite_hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int) -> FinitePlan:
     """Optimal plan over ``horizon`` steps; ties are shared evenly; any discount in (0, 1]."""
+    _require_numbers(mdp, "reward", reward)
 
     def back(values: Float[Array, " S"], _: None) -> tuple:
         q = action_values(mdp, reward, values)
@@ -424,6 +455,7 @@ def finite_occupancy(
     mdp: TabularMDP, policies: Float[Array, "T S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, "T S A"]:
     """Undiscounted visit probabilities ``P(s_t = s, a_t = a)`` of a time-dependent policy."""
+    _require_numbers(mdp, "policy", policies)
 
     def step(state: Float[Array, " S"], policy: Float[Array, "S A"]) -> tuple:
         pairs = state[:, None] * policy
@@ -456,6 +488,7 @@ def simulate(
     first: Int[Array, ""] | None = None,
 ) -> tuple[Int[Array, " T"], Int[Array, " T"]]:
     """Draw one trajectory of ``length`` pairs (states, actions) under a policy, from ``first`` or ``p0``."""
+    _require_numbers(mdp, "log-policy", log_policy)
     start_key, key = jax.random.split(as_key(key))
     state = jax.random.categorical(start_key, jnp.log(mdp.initial)) if first is None else jnp.asarray(first)
 

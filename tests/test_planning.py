@@ -384,3 +384,57 @@ def test_relabelling_states_relabels_the_plan_and_a_constant_reward_shifts_it(
     there = soft(moved, reward_of(moved, WEIGHTS) + constant)
     np.testing.assert_allclose(there.values, np.asarray(here.values)[order] + constant / 0.1, atol=1e-9)
     np.testing.assert_allclose(there.policy, np.asarray(here.policy)[order], atol=1e-10)
+
+
+def test_the_gradient_in_a_whole_process_is_that_of_its_probabilities(random_mdp):
+    mdp = random_mdp(3, n_successors=3, masked=True)
+    assert mdp.inflow_pairs is not None
+    mix = jnp.asarray(np.random.default_rng(3).normal(size=(4, S, mdp.n_actions)))
+
+    # Expectations of the next state plan, and masses pushed forward visit: both read the probabilities.
+    def value(mdp):
+        policies = jnp.exp(finite_soft_plan(mdp, reward_of(mdp, WEIGHTS), 4).log_policy)
+        return jnp.sum(mix * finite_occupancy(mdp, policies))
+
+    gradient = jax.jit(jax.grad(value, allow_int=True))(mdp).probabilities
+    along = jax.jit(lambda x: value(mdp.with_probabilities(mdp.probabilities + x)))
+    for pair in np.argwhere(np.asarray(mdp.available)):
+        for slot in range(mdp.probabilities.shape[2]):
+            step = jnp.zeros(mdp.probabilities.shape).at[(*pair, slot)].set(1e-5)
+            difference = (along(step) - along(-step)) / 2e-5
+            np.testing.assert_allclose(gradient[(*pair, slot)], difference, rtol=1e-6, atol=1e-9)
+
+
+NOT_NUMBERS = {
+    "soft plan": lambda mdp, bad: soft_plan(mdp, bad).values,
+    "hard plan": lambda mdp, bad: hard_plan(mdp, bad).values,
+    "greedy policy": lambda mdp, bad: deterministic_policy(hard_plan(mdp, bad).optimal),
+    "finite soft plan": lambda mdp, bad: finite_soft_plan(mdp, bad, 9).values[0],
+    "finite hard plan": lambda mdp, bad: finite_hard_plan(mdp, bad, 9).values[0],
+    "values of a policy": lambda mdp, bad: policy_values(mdp, jnp.ones_like(bad), bad),
+    "occupancy": lambda mdp, bad: occupancy(mdp, bad),
+    "features to go": lambda mdp, bad: features_to_go(mdp, bad),
+}
+
+
+@pytest.mark.parametrize("function", NOT_NUMBERS.values(), ids=NOT_NUMBERS)
+def test_nan_is_named_where_there_are_numbers_and_propagates_where_there_are_none(function, random_mdp):
+    mdp = random_mdp(0)
+    bad = jnp.ones((S, mdp.n_actions)).at[1, 2].set(jnp.nan)
+    with pytest.raises(ValueError, match=r"of state 1, action 2 is nan, not a number"):
+        function(mdp, bad)
+    # Every state of this process leads to every other.
+    assert np.isnan(jax.jit(function)(mdp, bad)).all()
+
+
+def test_nan_propagates_through_large_plans(sweeping, random_mdp):
+    mdp = random_mdp(0)
+    bad = jnp.ones((S, mdp.n_actions)).at[1, 2].set(jnp.nan)
+    for plan in (soft_plan, hard_plan):
+        assert np.isnan(jax.jit(plan)(mdp, bad).values).all()
+
+
+def test_nan_of_an_action_that_is_not_available_does_not_matter(random_mdp):
+    mdp = random_mdp(0, masked=True)
+    reward = jnp.where(mdp.available, 1.0, jnp.nan)
+    np.testing.assert_allclose(hard_plan(mdp, reward).values, 1 / (1 - mdp.discount))
