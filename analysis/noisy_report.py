@@ -333,9 +333,9 @@ def _lead(study: NoisyStudy) -> Lead:
     result, early = study.results[PLAIN], min(EARLY, study.sessions)
     final = float(result.accuracy[:, -1, 0].mean())
     learned = (
-        f"From {counted(study.sessions, 'session')} of {TRAJECTORIES} misreported trajectories each, RIMEO learned "
-        f"a reward whose policy does as the expert in {number(100 * final)} % of the states, and at the same "
-        "time how often perception is right."
+        f"From {counted(study.sessions, 'session')} of {TRAJECTORIES} misreported trajectories each, RIMEO "
+        f"learned a reward whose policy does as the expert in {number(100 * final)} % of the states, and at "
+        "the same time how often perception is right."
     )
     reach = float(np.mean(study.chance >= final - 1e-9))
     chance = (

@@ -425,8 +425,9 @@ def _lead(study: MethodsStudy) -> Lead:
     quickest = [(pairs, c.name) for c in study.curves[:-1] if (pairs := _pairs_to(study, c, 0.9)) is not None]
     others = f"; the quickest of the others does so from {min(quickest)[0]} on" if quickest else ""
     learned = (
-        f"From {counted(int(study.points[-1]), 'state-action pair')} of {study.patrol.name}, {name} learned a "
-        f"reward whose policy does as the expert in {number(100 * final)} % of the states, and {at}{others}."
+        f"From {counted(int(study.points[-1]), 'state-action pair')} of {study.patrol.name}, {name} learned "
+        f"a reward whose policy does as the expert in {number(100 * final)} % of the states, and {at}"
+        f"{others}."
     )
     reach = float(np.mean(study.chance >= final - 1e-9))
     streams = len(last.accuracy)

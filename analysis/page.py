@@ -218,7 +218,8 @@ class _Prose:
         if name in self._told:
             return name
         self._told.add(name)
-        return f"{name} ({GLOSSARY[name]})"
+        in_brackets = found.string[: found.start()].endswith("(")
+        return f"{name}: {GLOSSARY[name]}" if in_brackets else f"{name} ({GLOSSARY[name]})"
 
 
 def _require_sentence(text: str, what: str) -> None:

@@ -29,6 +29,9 @@ from .sorting_table import (
 )
 from .text import counted, listed, number
 
+# As in the posteriors of one reward.
+PRIOR_SCALE = 2.5
+
 if TYPE_CHECKING:
     from rich.console import Console
 
@@ -71,7 +74,8 @@ def summary(study: SortingStudy) -> dict[str, Any]:
 def _estimates(study: SortingStudy) -> dict[str, Estimates]:
     """Weights of every way that the first method found in the first run, named after what it is like.
 
-    Errors of maximum-entropy methods are those of the likelihood's curvature, given who did what; other
+    Errors of maximum-entropy methods are those of the posterior's curvature under a normal prior of scale
+    :data:`PRIOR_SCALE`, given who did what: experts who never err leave most directions to the prior. Other
     likelihoods have another curvature, and their weights no errors here.
     """
     result, mdp = study.results[0], study.sorting.mdp
@@ -86,7 +90,7 @@ def _estimates(study: SortingStudy) -> dict[str, Estimates]:
             share = np.broadcast_to(result.found.responsibilities[:, way, None], seen.shape)
             visits = np.bincount(demonstration.state[seen], share[seen], mdp.n_states)
             information = complete_information(mdp, jnp.asarray(weights), jnp.asarray(visits))
-            errors = laplace_errors(np.asarray(information))
+            errors = laplace_errors(np.asarray(information) + np.eye(len(weights)) / PRIOR_SCALE**2)
         name = study.sorting.behaviours[behaviour_of[way]] if way in behaviour_of else "like no behaviour"
         found[f"way {len(found) + 1}, {name}"] = Estimates(mdp.feature_names, weights, errors)
     return found
@@ -147,7 +151,7 @@ def _text(study: SortingStudy) -> str:
 steps come in one jumble. Learned from: {sizes} trajectories, the same for every method, in {_runs(study)}. \
 {methods} A way counts as found if it is the likeliest of some trajectory.
 
-The value difference (EVD) compares greedy policies, so a reward that is wrong in many ways may lose exactly \
+EVD compares greedy policies, so a reward that is wrong in many ways may lose exactly \
 nothing. Not all mistakes cost the same: where there is no list, the best roller picks as the picker does, \
 so taking a picker for a roller costs its first steps only.
 
@@ -208,9 +212,11 @@ def _lead(study: SortingStudy) -> Lead:
         estimates.table(
             f"Weights of {way}, that {result.name} found in the first run. "
             + (
-                "Intervals are those of the likelihood's curvature, given who did what."
+                "Intervals are those of the posterior's curvature under a normal prior of scale "
+                f"{PRIOR_SCALE}, given who did what; one of plus and minus {number(1.96 * PRIOR_SCALE, 2)} "
+                "says no more than the prior."
                 if np.isfinite(estimates.errors).any()
-                else "Its likelihood bounds no weight from above here, or none was computed."
+                else "No intervals are computed for its likelihood."
             )
         )
         for way, estimates in _estimates(study).items()

@@ -123,30 +123,30 @@ _FAMILIES = (
         "LME-I2RL": 0, "LME-I2RL with random weights": 1, "batch LME": 2,
         "batch LME, again after every session": 3, "random weights": 5, "true policy": 6,
     }),
-    _Family(2, 1, {
+    _Family(2, 0, {
         "Jin et al., table over states": 4, "Jin et al., features": 3, "DARKO, goals": 7,
         "DARKO, windows of 5": 5, "ME-I2RL, features": 2,
     }),
-    _Family(1, 2, {
+    _Family(0, 5, {
         "MME-MTIRL": 0, "online MME-MTIRL": 1, "DPM-BIRL": 2, "EM-MLIRL": 3, "EM-MLIRL, not told": 4,
     }),
-    _Family(3, 3, {
-        "RIMEO, no scores": 0, "RIMEO, scores averaged": 1, "RIMEO, scores stepwise": 2,
-        "RIMEO, predicates alone": 3, "RIFOM": 7,
+    _Family(0, 2, {
+        "RIMEO, no scores": 0, "RIMEO, scores averaged": 1, "RIMEO, scores stepwise": 2, "true sensor": 3,
+        "Robust IRL, batch": 4, "no noise": 5, "MLIRL, batch": 6, "RIFOM": 7,
     }),
-    _Family(4, 6, {"true sensor": 3, "no noise": 5, "Robust IRL, batch": 4, "MLIRL, batch": 6}),
-    _Family(5, 4, {"oracle": 4, "observed": 5, "RIFOM, as coded": 3, "all, as printed": 1}),
-    _Family(6, 5, {"hidden": 1, "hidden and noisy": 0}),
-    _Family(2, 6, {
+    _Family(4, 5, {"RIMEO, predicates alone": 3}),
+    _Family(5, 2, {"oracle": 4, "observed": 5, "RIFOM, as coded": 3, "all, as printed": 1}),
+    _Family(1, 0, {"hidden": 1, "hidden and noisy": 0}),
+    _Family(6, 2, {
         "AIRL, clean input": 5, "AIRL, noisy input": 1, "robust-AIRL, noisy input": 3,
         "SSRR + noisy-AIRL, noisy input": 2, "robust-AIRL, sensor learned": 4, "AIRL, noisy input, memory": 7,
     }),
-    _Family(2, 7, {"robust-AIRL": 3, "robust-AIRL, memory": 2}),
-    _Family(0, 5, {
+    _Family(1, 2, {"robust-AIRL": 3, "robust-AIRL, memory": 2}),
+    _Family(0, 1, {
         "i2rl": 0, "i2rl, by level": 5, "uniform": 6, "frequencies": 4, "frequencies of choices": 7,
         "given entry": 3, "level and entry": 2, "Markov": 1,
     }),
-    _Family(5, 7, {"MaxEnt": 0, "BIRL": 1, "BIRL, only open moves are actions": 4}),
+    _Family(0, 6, {"MaxEnt": 0, "BIRL": 1, "BIRL, only open moves are actions": 4}),
 )  # fmt: skip
 METHOD_LOOKS = {
     name: (colour, (colour + family.dashes) % 8, (colour + family.markers) % 8)

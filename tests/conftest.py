@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable
 from functools import partial
+from html import unescape
 from pathlib import Path
 from typing import NamedTuple
 
@@ -12,6 +14,7 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
+from i2rl.analysis.page import GLOSSARY
 from i2rl.models import Demonstration, TabularMDP
 from i2rl.models.demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN
 from i2rl.models.evidence import observe
@@ -32,6 +35,41 @@ def _compiled_programs_are_let_go():
     regions = Path("/proc/self/maps")
     if regions.exists() and len(regions.read_text().splitlines()) > _MANY_REGIONS:
         jax.clear_caches()
+
+
+@pytest.fixture
+def small_pictures(monkeypatch):
+    """Pages with pictures of few dots: what is on them is tested on figures themselves."""
+    monkeypatch.setattr("i2rl.analysis.style.DPI", 30)
+
+
+@pytest.fixture(scope="session")
+def page_faults() -> Callable[[str], list[str]]:
+    """What a reader of a page would stumble over; nothing, if all is well."""
+    return _page_faults
+
+
+def _page_faults(page: str) -> list[str]:
+    body = re.sub(r"<(style|h1|h2|title|footer|code)\b.*?</\1>", " ", page, flags=re.DOTALL)
+    text = unescape(re.sub(r"<[^>]*>", " ", body))
+    of_one = "run|seed|session|world|trajectorie|breache|belt|bout|patroller|feature|way"
+    patterns = {
+        "backtick": r"`",
+        "exponent": r"\d\.?\d*e[+-]?\d",
+        "not a number": r"\bnan\b",
+        "plural of one": rf"(?<![\d.,])1 (?:[a-z]+ )?(?:{of_one})s\b",
+    }
+    faults = [
+        f"{fault}: {hit[0]}" for fault, pattern in patterns.items() if (hit := re.search(pattern, text))
+    ]
+    if not re.search(r'</h1>\s*<p class="lead">', page):
+        faults.append("no lead")
+    for name, meaning in GLOSSARY.items():
+        stands = re.search(rf"(?<![\w-]){re.escape(name)}(?![\w-])", text) is not None
+        spelled = re.findall(rf"(?<![\w-]){re.escape(name)}(?: \(|: ){re.escape(meaning)}", text)
+        if len(spelled) != stands:
+            faults.append(f"{name} is spelled out {len(spelled)} times")
+    return faults
 
 
 def _random_mdp(

@@ -142,7 +142,8 @@ def test_recovery_shows_the_share_and_the_dissertations(hopper, patrol):
 
 
 def test_an_interval_without_an_end_is_shown_to_go_on(patrol):
-    methods = {m: r._replace(accuracy=np.random.default_rng(2).uniform(0.4, 0.6, (6, 8)) + 0.01 * i)
+    rng = np.random.default_rng(2)
+    methods = {m: r._replace(accuracy=rng.uniform(0.4, 0.6, (6, 8)) - 0.01 * i)
                for i, (m, r) in enumerate(patrol.methods.items())}  # fmt: skip
     unclear = patrol._replace(methods=methods)
     assert unclear.recovery().lost < 1
@@ -334,6 +335,7 @@ def test_a_loss_of_nothing_has_no_sign(hopper):
     assert recovery_table(hopper._replace(methods=slightly_better)).rows[0][1] == "0%"
 
 
+@pytest.mark.usefixtures("small_pictures")
 def test_a_trajectory_of_pairs_has_its_section(patrol, tmp_path, random_mdp):
     mdp = random_mdp(0)
     drawn = Demonstration.from_pairs(np.array([[0, 1, 2, 3, 0, 1]]), np.array([[0, 1, 2, 0, 1, 2]]))
@@ -387,8 +389,10 @@ def test_damaged_results_are_refused_by_file(text, tmp_path):
     assert len(str(caught.value)) < 400
 
 
-def test_the_report_holds_everything(hopper, patrol, tmp_path):
+@pytest.mark.usefixtures("small_pictures")
+def test_the_page_holds_everything(hopper, patrol, tmp_path, page_faults):
     page = write([patrol, hopper], tmp_path).read_text()
+    assert page_faults(page) == []
     for name in ("patrol-learning", "hopper-learning", "hopper-rewards", "hopper-belief", "hopper-frames",
                  "recovery"):  # fmt: skip
         assert (tmp_path / f"{name}-light.png").exists()

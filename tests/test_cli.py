@@ -601,13 +601,32 @@ def test_bounds_refuses_what_makes_no_sense(options, message):
     assert message in told.stderr
 
 
-def test_the_patrol_study_writes_its_report(tmp_path):
+@pytest.mark.usefixtures("small_pictures")
+def test_the_patrol_study_writes_its_page(tmp_path, page_faults):
     result = call(
         "run", "patrol", "--instance", 2, "--sessions", 3, "--trials", 4, "--runs", 1,
         "--report", tmp_path / "report", "--json",
     )  # fmt: skip
     assert json.loads(result.stdout) == json.loads((tmp_path / "report" / "results.json").read_text())
     page = (tmp_path / "report" / "index.html").read_text()
+    assert page_faults(page) == []
+    told = json.loads(result.stdout)
+    assert told["provenance"].keys() >= {"i2rl", "command", "seed", "versions"}
+    patrollers = told["reward"]["learned, first run"]
+    assert [p["patroller"] for p in patrollers] == ["the first patroller", "the second patroller"]
+    for p, weights in zip(
+        patrollers, told["reward"]["by method, run and patroller"]["LME-I2RL"][0], strict=True
+    ):
+        assert [w["weight"] for w in p["weights"]] == weights
+        assert all(
+            w["95 % interval"] is None or w["95 % interval"][0] < w["weight"] < w["95 % interval"][1]
+            for w in p["weights"]
+        )
+    # What random weights score stands beside what was learned, in words.
+    share = np.mean(np.array(told["random weights"]["LBA"]) >= told["methods"][0]["LBA"] - 1e-9)
+    assert f"{100 * share:.1f} % have the" in page
+    lengths, values = told["true weights"].values()
+    assert values[lengths.index(1.0)] == pytest.approx(told["methods"][-1]["log-likelihood"])
     pictures = sorted((tmp_path / "report").glob("*.png"))
     assert len(pictures) == 2 * page.count("<picture>") > 0  # for light and for dark screens
     for picture in pictures:

@@ -190,8 +190,10 @@ def test_an_empty_recording_is_refused():
         study([])
 
 
-def test_the_page_holds_pictures_in_both_themes_and_every_number(result, tmp_path):
+@pytest.mark.usefixtures("small_pictures")
+def test_the_page_holds_pictures_in_both_themes_and_every_number(result, tmp_path, page_faults):
     page = write(result, tmp_path / "new").read_text(encoding="utf-8")
+    assert page_faults(page) == []
     for name in ("bits-light.png", "bits-dark.png", "value-light.png", "value-dark.png"):
         assert (tmp_path / "new" / name).read_bytes().startswith(b"\x89PNG")
     assert page.count("<picture>") == 2

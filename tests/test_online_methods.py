@@ -91,19 +91,24 @@ def test_the_figure_shows_the_medians(theme):
     assert {axes.get_xscale() for axes in figure.axes} == {"log"}
 
 
-def test_run_methods_writes_a_report(tmp_path, monkeypatch):
+@pytest.mark.usefixtures("small_pictures")
+def test_run_methods_writes_a_page(tmp_path, monkeypatch, page_faults):
     monkeypatch.setattr(online_methods, "study", lambda *_, **__: small_study())
     folder = tmp_path / "report"
     shown = CliRunner().invoke(app, ["run", "methods", "--report", str(folder)])
     assert shown.exit_code == 0, shown.output
     assert "DARKO" in shown.output
     page = (folder / "index.html").read_text()
-    assert page.count("<table") == 3
+    assert page.count("<table") == 4
+    assert page_faults(page) == []
     assert "data:image/png" in page
     result = CliRunner().invoke(app, ["run", "methods", "--report", str(folder), "--json"])
     content = json.loads(result.output)
     assert content == json.loads((folder / "results.json").read_text())
     assert content["pairs"][-1] == 40
+    weights = np.array(content["methods"][-1]["weights"])
+    assert weights.shape == (2, small_study().patrol.mdp.n_features)
+    assert [x["weight"] for x in content["weights, first stream"]] == weights[0].tolist()
     assert [row["method"] for row in content["table 8.1"]][-1] == "batch LME, of one stream"
 
 

@@ -211,16 +211,28 @@ def test_legend_and_small_print_of_a_single_method_fit_the_figure(plot):
         assert whole.x0 <= box.x0 < box.x1 <= whole.x1
 
 
-def test_command_writes_its_report(tmp_path):
+@pytest.mark.usefixtures("small_pictures")
+def test_command_writes_its_page(tmp_path, monkeypatch, page_faults):
+    asked = {}
+
+    def shared(tasks, counts, **options):
+        asked.update(options, tasks=tasks, counts=list(counts))
+        return small()
+
+    monkeypatch.setattr(sorting_study, "study", shared)
     command = ["run", "sorting", "--trajectories", "6", "--runs", "1", "--method", "em-mlirl", "--steps"]
     command += ["20", "--belts", "10", "--json", "--report", str(tmp_path)]
     result = CliRunner().invoke(app, command)
     assert result.exit_code == 0, result.output
+    assert (asked["counts"], asked["runs"], asked["steps"]) == ([6], 1, 20)
+    assert (asked["belts"], asked["methods"]) == (10, ("em-mlirl",))
     told = json.loads(result.stdout)
     assert told == json.loads((tmp_path / "results.json").read_text())
-    assert [m["method"] for m in told["methods"]] == ["EM-MLIRL"]
+    assert [m["method"] for m in told["methods"]] == ["DPM-BIRL", "EM-MLIRL"]
     assert told["methods"][0]["trajectories"] == [6]
+    assert len(told["ways of the first run"]) == len(set(small().results[0].found.assignments.tolist()))
     page = (tmp_path / "index.html").read_text()
+    assert page_faults(page) == []
     assert "EM-MLIRL" in page
     assert page.count("<figure>") == 6
     for name in ("clusters", "ways", "evd", "number", "time", "table"):
@@ -244,6 +256,17 @@ def test_command_tells_mistakes_in_one_line(options, complaint, tmp_path):
     assert "Traceback" not in result.output
     assert complaint in " ".join(result.output.split())
     assert not (tmp_path / "none").exists()
+
+
+@pytest.mark.parametrize("plot", ["evd_plot", "time_plot"])
+def test_a_single_number_of_trajectories_is_one_place_on_the_axis(plot):
+    (axes,) = getattr(sorting_figures, plot)(small(), LIGHT).axes
+    low, high = np.log(axes.get_xlim())
+    dots = np.log(
+        np.concatenate([line.get_xdata() for line in axes.get_lines() if line.get_marker() != "None"])
+    )
+    assert np.ptp(dots) < 0.2 * (high - low)
+    assert abs(np.log(6) - (low + high) / 2) < 0.1 * (high - low)
 
 
 def test_tables_print():
