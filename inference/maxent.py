@@ -464,8 +464,8 @@ def exponentiated_gradient(
     ``z`` of line 15 descends the likelihood (the dissertation's code has ``exp(-2c (E[phi] - phi_hat))``,
     the sign used here); and ``E[phi]`` of line 14 is exact, not an average of sampled trajectories.
 
-    Scaled weights stay positive and sum to one. The solver therefore cannot express a negative weight, nor how
-    deterministic the expert is (the length of the weight vector), and for most experts no point of the
+    Scaled weights stay positive and sum to one. The solver therefore cannot express a negative weight, nor
+    how deterministic the expert is (the length of the weight vector), and for most experts no point of the
     simplex meets the stopping rule: it then ends after ``max_steps`` with ``converged`` false. Kept to
     replicate; :func:`solve_dual` solves the program the theorems are about.
 

@@ -70,6 +70,8 @@ class DualSolution(NamedTuple):
         The minimised objective at these weights, penalties included (nats).
     iterations : int
         Of IPOPT.
+    converged : bool
+        Whether IPOPT met its tolerance; what is returned to a caller has.
     warm : IpoptPoint
         Where to start the next session from.
     """
@@ -78,6 +80,7 @@ class DualSolution(NamedTuple):
     values: Float[np.ndarray, " S"]
     objective: float
     iterations: int
+    converged: bool
     warm: IpoptPoint
 
 
@@ -189,9 +192,7 @@ class _SoftBellmanProgram:
         )
         return self._solve(problem, _PROXIMAL, point)
 
-    def _solve(
-        self, problem: _Problem, proximal: float, warm: IpoptPoint | None
-    ) -> tuple[DualSolution, str]:
+    def _solve(self, problem: _Problem, proximal: float, warm: IpoptPoint | None) -> tuple[DualSolution, str]:
         """Solve from one start, with a proximal term of this share that is centred there."""
         n_states, n_features = self.mdp.n_states, self.mdp.n_features
         state_weights, features, slack, ridge, pinned = problem
@@ -236,7 +237,10 @@ class _SoftBellmanProgram:
         if not status and proximal == _PROXIMAL and held > _HELD * (1 + np.abs(features).max()):
             status = "weights that grow without bound"
         iterations = int(statistics["iter_count"])
-        return DualSolution(weights / self._scale, values, float(objective), iterations, point), status
+        return (
+            DualSolution(weights / self._scale, values, float(objective), iterations, not status, point),
+            status,
+        )
 
 
 class DualProgram(_SoftBellmanProgram):

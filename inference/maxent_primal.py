@@ -49,6 +49,8 @@ class PrimalSolution(NamedTuple):
         The optimal discounted occupancy; it sums to ``1 / (1 - gamma)``.
     iterations : int
         Of the solver.
+    converged : bool
+        Whether the solver met its tolerances, rather than the reduced ones where rounding stopped it.
     """
 
     weights: Float[np.ndarray, " K"]
@@ -56,6 +58,7 @@ class PrimalSolution(NamedTuple):
     objective: float
     occupancy: Float[np.ndarray, "S A"]
     iterations: int
+    converged: bool
 
 
 class _Compiled(NamedTuple):
@@ -131,6 +134,7 @@ class PrimalProgram:
             float(program.problem.value),
             occupancy,
             int(program.problem.solver_stats.num_iters or 0),
+            program.problem.status == cp.OPTIMAL,
         )
 
     def _program(self, reachable: np.ndarray) -> _Compiled:

@@ -20,6 +20,7 @@ from jaxtyping import Array, Float, Int
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted
+from ..models.units import feature_scale, with_scaled_features
 from .boltzmann import (
     BOX,
     ETA,
@@ -38,7 +39,7 @@ class MLIRLFit(NamedTuple):
     Fields
     ------
     weights : float ``[K]``
-        Of the best start, in ``[-1, 1]``.
+        Of the best start; scaled weights lie in ``[-1, 1]``.
     log_likelihood : float
         Of the whole demonstration, in nats, transition probabilities left out.
     objective : float ``[restarts]``
@@ -121,7 +122,9 @@ def mlirl(
     restarts: int = 5,
     iterations: int = 300,
 ) -> MLIRLFit:
-    """Maximum-likelihood IRL: the weights in ``[-1, 1]^K`` under which the demonstration is likeliest.
+    """Maximum-likelihood IRL: the weights under which the demonstration is likeliest.
+
+    Scaled weights (:mod:`~i2rl.models.units`) are looked for in ``[-1, 1]^K``.
 
     Parameters
     ----------
@@ -145,10 +148,11 @@ def mlirl(
     require_discounted(mdp)
     require_positive(eta=eta, restarts=restarts, iterations=iterations)
     counts = visit_counts(mdp, demonstration).sum(0)
-    ends = _climb(key, mdp, jnp.asarray(counts), jnp.asarray(float(eta)), restarts, iterations)
+    scaled = with_scaled_features(mdp)
+    ends = _climb(key, scaled, jnp.asarray(counts), jnp.asarray(float(eta)), restarts, iterations)
     best = int(np.argmax(ends.value))
     return MLIRLFit(
-        np.asarray(ends.weights[best]),
+        np.asarray(ends.weights[best] / feature_scale(mdp)),
         float(ends.value[best]),
         np.asarray(ends.value),
         np.asarray(ends.iterations),
@@ -260,7 +264,8 @@ def em_mlirl(
 
     Responsibilities ``v_{d,i} ~ rho_d prod_t pi_eta(a_t | s_t; theta_d)``; proportions are their means;
     weights climb the responsibility-weighted log-likelihood from where they were, so the marginal
-    log-likelihood never falls. Starts: weights uniform on the box, equal proportions.
+    log-likelihood never falls. Starts: weights uniform on the box, equal proportions. The box ``[-1, 1]^K``
+    is of scaled weights (:mod:`~i2rl.models.units`).
 
     Parameters
     ----------
@@ -287,6 +292,7 @@ def em_mlirl(
     """
     require_discounted(mdp)
     require_positive(clusters=clusters, eta=eta, iterations=iterations, restarts=restarts, ascents=ascents)
+    scale, scaled = feature_scale(mdp), with_scaled_features(mdp)
 
     def trace(key: Array, demonstration: Demonstration) -> EMTrace:
         counts = visit_counts(mdp, demonstration)
@@ -294,7 +300,7 @@ def em_mlirl(
         # Rows of padding would count for the proportions.
         real = demonstration.lengths > 0
         mixtures, responsibilities, history = _em(
-            key, mdp, jnp.asarray(counts[real]), jnp.asarray(float(eta)),
+            key, scaled, jnp.asarray(counts[real]), jnp.asarray(float(eta)),
             clusters, restarts, iterations, ascents,
         )  # fmt: skip
         best = int(np.argmax(history[:, -1]))
@@ -302,7 +308,7 @@ def em_mlirl(
         rows = np.broadcast_to(proportions, (len(real), clusters)).copy()
         rows[real] = responsibilities[best]
         clustering = Clustering(
-            np.asarray(mixtures.weights[best]), proportions, rows, float(history[best, -1])
+            np.asarray(mixtures.weights[best] / scale), proportions, rows, float(history[best, -1])
         )
         return EMTrace(clustering, np.asarray(history))
 

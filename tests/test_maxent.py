@@ -10,9 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from i2rl.inference.maxent import (
+    LinearObjective,
     WarmStart,
     _expand,
-    LinearObjective,
     count_objective,
     exponentiated_gradient,
     fit_counts,
