@@ -31,6 +31,7 @@ from ..models.demonstration import SEEN, Demonstration
 from ..models.evidence import Imperfection, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted, reward_of, soft_plan
+from ..models.units import feature_scale, with_scaled_features
 from .estimates import Estimates
 from .information import observed_information, total_log_likelihoods
 from .invariance import NOT_VISITED, WEAK, Direction, combination, sparse_basis, unidentified_directions
@@ -55,6 +56,7 @@ class Identifiability(NamedTuple):
         Of each weight, from the inverse of the information; infinite if an exactly unidentified direction
         moves it or the likelihood does not curve downward.
     exact, weak : directions of the two sorts
+        Exact ones are of the weights as given, weak ones of scaled weights (:mod:`~i2rl.models.units`).
     scale : float
         A direction counts as weakly determined if its standard error exceeds this.
     length_loss : (float, float)
@@ -107,8 +109,8 @@ def identifiability_of(
     """Find and name the directions of weight space that a demonstration does not determine.
 
     Exactly unidentified ones by :func:`unidentified_directions`; weakly determined ones among the rest as
-    eigenvectors of the observed information with a standard error above ``scale``, turned so that each
-    involves few features.
+    eigenvectors of the observed information about scaled weights with a standard error above ``scale``,
+    turned so that each involves few features.
 
     Parameters
     ----------
@@ -118,8 +120,8 @@ def identifiability_of(
         Where to look at the likelihood; the posterior mode under the prior ``Normal(0, 2.5)`` by default
         (the likelihood itself need not have a maximum).
     scale : float
-        How large weights are reasonably thought to be; the default is the prior's standard deviation, so
-        that a weakly determined direction is one of which the demonstration says less than the prior.
+        How large scaled weights (:mod:`~i2rl.models.units`) are reasonably thought to be; the default is the
+        prior's standard deviation, so that a weakly determined direction is one of which the demonstration says less than the prior.
 
     Raises
     ------
@@ -136,18 +138,22 @@ def identifiability_of(
     if not scale > 0:
         raise ValueError(f"scale must be positive, got {scale}")
     require_possible(sensor, mdp, demonstration)
+    units = np.asarray(feature_scale(mdp))
     if weights is None:
-        weights = jnp.asarray(posterior_mode(gather(mdp, sensor, demonstration)[0]).position)
+        # Unconstrained positions under a normal prior are scaled weights.
+        weights = posterior_mode(gather(mdp, sensor, demonstration)[0]).position / units
     theta = np.asarray(weights, float)
     if theta.shape != (mdp.n_features,) or not np.isfinite(theta).all():
         raise ValueError(f"weights must be {mdp.n_features} numbers, one a feature, got {theta}")
+    as_given = mdp
+    mdp, theta = with_scaled_features(mdp), theta * units
     given = (mdp, sensor, demonstration.bucketed())
     # Zero weights take every action everywhere: what they cannot have visited, nobody can.
     visited = np.asarray(_shown(jnp.zeros(mdp.n_features), *given)[0]) > 0
     seen = np.asarray(_shown(jnp.asarray(theta), *given)[1]) > 1e-9
     information = observed_information(mdp, sensor, jnp.asarray(theta), demonstration)
-    exact = unidentified_directions(mdp, visited)
-    rest = _complement(exact, mdp.n_features)
+    exact = unidentified_directions(as_given, visited)
+    rest = _complement([direction.vector * units for direction in exact], mdp.n_features)
     values, axes = np.linalg.eigh(rest.T @ information @ rest)
     axes = rest @ axes
     weak = sparse_basis(axes[:, values < scale**-2], _MINOR)
@@ -165,9 +171,9 @@ def identifiability_of(
     ]
     return Identifiability(
         mdp.feature_names,
-        theta,
-        information,
-        _standard_errors(values, axes, exact),
+        theta / units,
+        information * np.outer(units, units),
+        _standard_errors(values, axes, exact) / units,
         tuple(direction._replace(loss=(0.0, 0.0)) for direction in exact),
         tuple(sorted(directions, key=lambda direction: -direction.standard_error)),
         scale,
@@ -175,11 +181,11 @@ def identifiability_of(
     )
 
 
-def _complement(directions: Sequence[Direction], size: int) -> Float[np.ndarray, "K r"]:
-    if not directions:
+def _complement(vectors: Sequence[Float[np.ndarray, " K"]], size: int) -> Float[np.ndarray, "K r"]:
+    if not vectors:
         return np.eye(size)
-    span = np.stack([direction.vector for direction in directions], axis=1)
-    return np.linalg.qr(span, mode="complete")[0][:, len(directions) :]
+    span = np.stack([vector / np.linalg.norm(vector) for vector in vectors], axis=1)
+    return np.linalg.qr(span, mode="complete")[0][:, len(vectors) :]
 
 
 def _standard_errors(
@@ -279,7 +285,7 @@ def directions_table(result: Identifiability) -> pd.DataFrame:
         {
             "kind": d.kind,
             "exact": d.exact,
-            "direction": combination(result.features, d.vector, 1e-6 if d.exact else _MINOR),
+            "direction": combination(result.features, d.vector, 0.0 if d.exact else _MINOR),
             "standard_error": d.standard_error,
             "loss_along": d.loss[0],
             "loss_against": d.loss[1],

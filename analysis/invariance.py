@@ -172,15 +172,15 @@ def _pivots(vectors: Float[np.ndarray, "K m"]) -> list[int]:
 # -- names --------------------------------------------------------------------------------------------
 
 
-def combination(features: Sequence[str], vector: Float[np.ndarray, " K"], least: float = 1e-6) -> str:
+def combination(features: Sequence[str], vector: Float[np.ndarray, " K"], least: float = 0.0) -> str:
     """A direction in words, such as ``\\`moves\\` + 0.5 \\`turns\\```, its largest coefficient scaled to one.
 
-    Coefficients below ``least`` times the largest are left out.
+    Coefficients that are zero or below ``least`` times the largest are left out.
     """
     relative = vector / vector[np.argmax(np.abs(vector) > (1 - 1e-9) * np.abs(vector).max())]
     words = ""
     for name, value in zip(features, relative, strict=True):
-        if abs(value) < least:
+        if value == 0 or abs(value) < least:
             continue
         sign = ("-" if not words else " - ") if value < 0 else ("" if not words else " + ")
         amount = "" if abs(abs(value) - 1) < 5e-4 else f"{number(abs(value))} "

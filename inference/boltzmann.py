@@ -21,7 +21,7 @@ from ..models.planning import action_values, hard_plan, policy_values, reward_of
 
 # Inverse temperature of the published baselines.
 ETA = 10.0
-# Weights lie in [-BOX, BOX]: the likelihood of a greedy expert has no maximum without a bound.
+# Scaled weights lie in [-BOX, BOX]: the likelihood of a greedy expert has no maximum without a bound.
 BOX = 1.0
 
 

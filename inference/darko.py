@@ -24,6 +24,7 @@ import math
 import time
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -37,6 +38,7 @@ from ..models.demonstration import PAD, SEEN, UNKNOWN, Demonstration, Demonstrat
 from ..models.evidence import Sensor, checked_demonstration, require_possible
 from ..models.mdp import Labels, TabularMDP
 from ..models.planning import features_to_go, require_discounted, reward_of, soft_plan
+from .scaling import on_scaled_features
 from .session import Learner, Report
 from .smoothing import Evidence, evidence_of, smooth_all
 from .statistic import FEATURES, FeatureStatistic, complete
@@ -131,13 +133,13 @@ def darko_i2rl(
         The expert's process, discount below 1; goals that end the task as :func:`ending_at` makes them.
         Its initial distribution must allow the goals, where sessions start.
     learning_rate : float
-        ``lambda``, per unit of discounted features. The default is what ``i2rl run methods`` finds good on
-        the second patrol, from sessions of five steps.
+        ``lambda``, per unit of discounted scaled features (:mod:`~i2rl.models.units`). The default is what
+        ``i2rl run methods`` finds good on the second patrol, from sessions of five steps.
     decay : float
         ``lambda_i = lambda / i^decay``. One half is what keeps the regret of online gradient descent
         without a horizon sublinear (Zinkevich 2003); 0 keeps the rate constant.
     radius : float
-        Bound on the weights' Euclidean norm; none by default.
+        Bound on the Euclidean norm of the scaled weights; none by default.
     steps : int
         Gradient steps a session.
 
@@ -154,6 +156,10 @@ def darko_i2rl(
     ValueError
         For discount 1 or an option that is out of range.
     """
+    return on_scaled_features(mdp, partial(_learner, learning_rate, decay, radius, steps))
+
+
+def _learner(learning_rate: float, decay: float, radius: float, steps: int, mdp: TabularMDP) -> Learner:
     require_discounted(mdp)
     if not 0 < learning_rate < math.inf or not radius > 0:
         raise ValueError(f"learning rate and radius must be positive, got {learning_rate} and {radius}")
@@ -225,6 +231,7 @@ def _session(
         "gradient": first,
         "iterations": settings.steps,
         "solver_iterations": settings.steps,
+        "converged": jnp.array(True),
         "seconds": jnp.array(jnp.nan),
         "weights": weights,
     }

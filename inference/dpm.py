@@ -25,6 +25,7 @@ from ..models.arguments import as_key
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted
+from ..models.units import feature_scale, with_scaled_features
 from .boltzmann import (
     BOX,
     ETA,
@@ -298,8 +299,8 @@ def dpm_birl(
     and accepts with ``min(1, P(X | theta') / P(X | theta))``; then moves every cluster's weights
     ``updates`` times. Starts from a random one of ``n`` labels for each trajectory.
 
-    The prior of a cluster's weights is uniform on the box, the default of the authors' code; the dissertation
-    writes a Gaussian base distribution, whose width it does not give.
+    The prior of a cluster's scaled weights (:mod:`~i2rl.models.units`) is uniform on the box, the default of
+    the authors' code; the dissertation writes a Gaussian base distribution, whose width it does not give.
 
     One deviation from the authors' code: it clips a proposed weight that leaves the box, which has no
     density to correct for and piles weights up on the boundary. Here the drift is clipped and the noise
@@ -316,7 +317,7 @@ def dpm_birl(
     sweeps, proposals, updates : int
         Outer iterations; assignment proposals per trajectory and weight moves per cluster in each.
     sigma : float
-        Width of the weights' moves, at most 0.5.
+        Width of the scaled weights' moves, at most 0.5.
 
     Returns
     -------
@@ -333,6 +334,7 @@ def dpm_birl(
     require_positive(eta=eta, alpha=alpha, sweeps=sweeps, proposals=proposals, updates=updates, sigma=sigma)
     if sigma > _WIDEST:
         raise ValueError(f"sigma must be at most {_WIDEST}, a quarter of the box [-1, 1], got {sigma}")
+    scale, scaled = np.asarray(feature_scale(mdp)), with_scaled_features(mdp)
     settings = Settings(*(jnp.asarray(float(x)) for x in (alpha, eta, sigma)))
 
     def sample(key: Array, demonstration: Demonstration) -> DPMTrace:
@@ -341,13 +343,13 @@ def dpm_birl(
         places, table, *rest = (
             np.asarray(x)
             for x in _sample(
-                as_key(key), mdp, jnp.asarray(counts[real]), settings, sweeps, proposals, updates
+                as_key(key), scaled, jnp.asarray(counts[real]), settings, sweeps, proposals, updates
             )
         )
         labels = np.full((sweeps, len(real)), -1)
         labels[:, real] = [_by_appearance(row) for row in places]
         weights = np.full((sweeps, len(real), mdp.n_features), np.nan)
-        weights[:, real] = np.take_along_axis(table, places[..., None], axis=1)
+        weights[:, real] = np.take_along_axis(table, places[..., None], axis=1) / scale
         return DPMTrace(labels, labels.max(1) + 1, weights, *rest)
 
     def fit(key: Array, demonstration: Demonstration) -> Clustering:

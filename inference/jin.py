@@ -31,6 +31,7 @@ from ..models.demonstration import SEEN, UNKNOWN, Demonstration, DemonstrationEr
 from ..models.evidence import checked_demonstration
 from ..models.mdp import Labels, TabularMDP
 from ..models.planning import deterministic_policy, hard_plan, occupancy, require_discounted, reward_of
+from .scaling import on_scaled_features
 from .session import Learner, Report
 
 
@@ -124,10 +125,11 @@ def jin_i2rl_with_features(mdp: TabularMDP, *, learning_rate: float = 0.3) -> Le
     """The same corrections to the weights of ``mdp``'s own features; parameters as for :func:`jin_i2rl`.
 
     A control: what the method reaches where the features of the domain are given to it as to the others.
-    Weights start at ``1 / sqrt(K)``, so here the learning rate matters; the default is what
+    Scaled weights (:mod:`~i2rl.models.units`) start at ``1 / sqrt(K)``, and corrections are of them, so here
+    the learning rate matters; the default is what
     ``i2rl run methods`` finds good on the second patrol.
     """
-    return _learner("Jin et al. with features", mdp, learning_rate)
+    return on_scaled_features(mdp, lambda scaled: _learner("Jin et al. with features", scaled, learning_rate))
 
 
 def _learner(name: str, mdp: TabularMDP, learning_rate: float) -> Learner:
@@ -184,6 +186,7 @@ def _session(
         "gradient": jnp.linalg.norm(weights - state.weights) / rate,
         "iterations": jnp.sum(full),
         "solver_iterations": mistakes,
+        "converged": jnp.array(True),
         "seconds": jnp.array(jnp.nan),
         "weights": weights,
     }

@@ -26,14 +26,16 @@ from ..models.demonstration import Demonstration, DemonstrationError
 from ..models.evidence import Imperfection, Sensor, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
 from ..models.planning import SoftPlan, require_discounted, reward_of, soft_plan
-from .maxent import Solution, WarmStart, exponentiated_gradient, fit_counts, solve_dual
+from ..models.units import feature_scale, with_scaled_features
+from .maxent import Solution, WarmStart, exponentiate_scaled, fit_scaled_counts, solve_scaled_dual
 from .maxent_constraints import FeatureTarget
+from .scaling import on_scaled_features
 from .schedule import Schedule, described, program_slack, require_slack, require_slack_in
 from .session import Learner, Report
 from .smoothing import Evidence, blocked_posterior, evidence_of, gibbs_posterior, smooth_all
 from .statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
 
-# Nats per trajectory and unit of weight. Smaller lets nearly deterministic experts be nearly deterministic.
+# Nats per trajectory and unit of scaled weight. Smaller lets nearly deterministic experts be nearly so.
 DEFAULT_SLACK = 0.002
 # Lemma 2 with eps_s = 0.05 and delta_s = 0.1 for six features (section 7.4.1).
 DEFAULT_DRAWS = 957
@@ -74,6 +76,7 @@ class _Iterate(NamedTuple):
     gradient: Float[Array, ""]
     iterations: Int[Array, ""]
     solver_iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
     key: Array
 
 
@@ -148,16 +151,17 @@ def lme_i2rl(
         session; the CVXPY primal; the normalised exponentiated gradient as printed. The last two solve the
         program of the ``features`` statistic only.
     slack : float or function of the session's number
-        Relaxation ``epsilon`` of the matching constraint: an L1 penalty of ``slack`` nats per trajectory
+        Relaxation ``epsilon`` of the matching constraint: an L1 penalty of ``slack`` nats per trajectory on
+        scaled weights, rewards in nats that each feature adds at most (:mod:`~i2rl.models.units`)
         (``slack / (1 - gamma)`` with the ``features`` statistic, as in Theorem 1). Or a schedule, as in
         Optax: a function that JAX can trace from the session's number, counted from 1, to it;
         :class:`~.schedule.Harmonic` is that of the no-regret theorem (Eq. 4.3).
     ridge : float
-        Precision of a Gaussian prior on the weights (nats in all, not per trajectory); for the newton and
-        ipopt solvers.
+        Precision of a Gaussian prior on the scaled weights (nats in all, not per trajectory); for the newton
+        and ipopt solvers.
     iterations, tolerance : int, float
-        A session ends after so many E- and M-steps, or when no weight moves by more than ``tolerance``
-        relative to the largest.
+        A session ends after so many E- and M-steps, or when no scaled weight moves by more than
+        ``tolerance`` relative to the largest.
 
     Returns
     -------
@@ -173,15 +177,19 @@ def lme_i2rl(
     """
     require_discounted(mdp)
     sensor = fitting_sensor(sensor, mdp)
-    method = _method(mdp, sensor, statistic, completion, slack, ridge, draws)
-    configuration = {
-        "statistic": statistic, "completion": completion, "solver": solver, "slack": described(slack),
-        "ridge": ridge,
-        "draws": draws if completion != "exact" else 0, "iterations": iterations, "tolerance": tolerance,
-        "sensor": _digest(sensor),
-    }  # fmt: skip
-    start = partial(_carried_on, method)
-    return _learner(name, method, start, solver, iterations, tolerance, configuration)
+
+    def build(mdp: TabularMDP) -> Learner:
+        method = _method(mdp, sensor, statistic, completion, slack, ridge, draws)
+        configuration = {
+            "statistic": statistic, "completion": completion, "solver": solver, "slack": described(slack),
+            "ridge": ridge,
+            "draws": draws if completion != "exact" else 0, "iterations": iterations, "tolerance": tolerance,
+            "sensor": _digest(sensor),
+        }  # fmt: skip
+        start = partial(_carried_on, method)
+        return _learner(name, method, start, solver, iterations, tolerance, configuration)
+
+    return on_scaled_features(mdp, build)
 
 
 def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Learner:
@@ -192,15 +200,19 @@ def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: Imperfection, **option
     sensor = fitting_sensor(sensor, mdp)
     carried = lme_i2rl(mdp, sensor, name="LME-I2RL with random weights", **options)
     configuration = carried.configuration
-    method = _method(
-        mdp, sensor, configuration["statistic"], configuration["completion"],
-        options.get("slack", DEFAULT_SLACK), configuration["ridge"], configuration["draws"],
-    )  # fmt: skip
-    start = partial(_started_afresh, method)
-    return _learner(
-        carried.name, method, start, configuration["solver"], configuration["iterations"],
-        configuration["tolerance"], configuration,
-    )  # fmt: skip
+
+    def build(mdp: TabularMDP) -> Learner:
+        method = _method(
+            mdp, sensor, configuration["statistic"], configuration["completion"],
+            options.get("slack", DEFAULT_SLACK), configuration["ridge"], configuration["draws"],
+        )  # fmt: skip
+        start = partial(_started_afresh, method)
+        return _learner(
+            carried.name, method, start, configuration["solver"], configuration["iterations"],
+            configuration["tolerance"], configuration,
+        )  # fmt: skip
+
+    return on_scaled_features(mdp, build)
 
 
 def me_i2rl(mdp: TabularMDP, **options: Any) -> Learner:
@@ -251,7 +263,7 @@ def _digest(sensor: Imperfection) -> str:
 
 
 def _random_weights(key: Array, mdp: TabularMDP) -> Float[Array, " K"]:
-    """``theta^0_k ~ uniform(0, 1)`` (Algorithm 1, line 2)."""
+    """``theta^0_k ~ uniform(0, 1)``, scaled (Algorithm 1, line 2)."""
     return jax.random.uniform(key, (mdp.n_features,), float)
 
 
@@ -266,14 +278,15 @@ def _started_afresh(method: _Method, key: Array, state: LMEState) -> tuple:
 
 def _newton(mdp: TabularMDP, statistic: Any, slack: Array, ridge: Array, start: WarmStart) -> Solution:
     if isinstance(statistic, FeatureStatistic):
-        return solve_dual(mdp, FeatureTarget(statistic.features, statistic.start), slack, ridge, start)
-    return fit_counts(mdp, statistic.counts, slack, ridge, start)
+        target = FeatureTarget(statistic.features, statistic.start)
+        return solve_scaled_dual(mdp, target, slack, ridge, start)
+    return fit_scaled_counts(mdp, statistic.counts, slack, ridge, start)
 
 
 def _exponentiated(mdp: TabularMDP, statistic: Any, slack: Array, ridge: Array, start: WarmStart) -> Solution:
     del ridge  # the printed update has no prior
     target = FeatureTarget(statistic.features, statistic.start)
-    return exponentiated_gradient(mdp, target, slack * (1 - mdp.discount), start=start.weights)
+    return exponentiate_scaled(mdp, target, slack * (1 - mdp.discount), start=start.weights)
 
 
 def _em(
@@ -305,14 +318,15 @@ def _em(
         )
         return _Iterate(
             solution.weights, solution.values, _change(point.weights, solution.weights), gradient,
-            point.iterations + 1, point.solver_iterations + solution.iterations, key,
+            point.iterations + 1, point.solver_iterations + solution.iterations, solution.converged, key,
         )  # fmt: skip
 
     def unfinished(point: _Iterate) -> Bool[Array, ""]:
         return (point.change > tolerance) & (point.iterations < iterations)
 
     zero = jnp.zeros((), int)
-    first = _Iterate(weights, values, jnp.array(jnp.inf), jnp.array(jnp.inf), zero, zero, key)
+    unsolved = jnp.array(False)
+    first = _Iterate(weights, values, jnp.array(jnp.inf), jnp.array(jnp.inf), zero, zero, unsolved, key)
     return lax.while_loop(unfinished, step, first)
 
 
@@ -343,6 +357,7 @@ def _close(
         "gradient": point.gradient,
         "iterations": point.iterations,
         "solver_iterations": point.solver_iterations,
+        "converged": point.converged,
         "seconds": jnp.array(jnp.nan),
         "weights": point.weights,
     }
@@ -421,7 +436,7 @@ def _learner(
 
         def run(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
             evidence, seen, key, weights, values = opening(state, demonstration)
-            program, total, steps, change = state.program, 0, 0, np.inf
+            program, total, steps, change, converged = state.program, 0, 0, np.inf, False
             first = jnp.array(jnp.nan)
             while steps < iterations and change > tolerance:
                 key, values, own, gradient, working, slack, ridge = expectation(
@@ -434,7 +449,14 @@ def _learner(
                 change = float(_change(weights, jnp.asarray(solution.weights)))
                 weights, values = jnp.asarray(solution.weights), jnp.asarray(solution.values)
                 total, steps = total + int(solution.iterations), steps + 1
-            counted = (jnp.array(change), first, jnp.array(steps), jnp.array(total))
+                converged = solution.converged
+            counted = (
+                jnp.array(change),
+                first,
+                jnp.array(steps),
+                jnp.array(total),
+                jnp.array(converged),
+            )
             point = _Iterate(weights, values, *counted, key)
             return closing(state, point, program, evidence, seen)
 
@@ -489,12 +511,15 @@ class BatchFit(NamedTuple):
         Penalised log-likelihood (per trajectory) reached from each start.
     iterations : int ``[restarts]``
         E- and M-steps of each.
+    converged : bool ``[restarts]``
+        Whether each one's last program met its tolerance.
     """
 
     weights: Float[np.ndarray, " K"]
     log_likelihood: float
     objective: Float[np.ndarray, " restarts"]
     iterations: Int[np.ndarray, " restarts"]
+    converged: Bool[np.ndarray, " restarts"]
 
 
 class Batch(NamedTuple):
@@ -525,6 +550,8 @@ def batch_lme(
     if callable(slack):
         raise ValueError("batch learning has no sessions, so its slack must be a number, not a schedule")
     sensor = fitting_sensor(sensor, mdp)
+    given, mdp = mdp, with_scaled_features(mdp)
+    scale = np.asarray(feature_scale(given))
     method = _method(mdp, sensor, "counts", "exact", slack, ridge, 0)
 
     @jax.jit
@@ -553,7 +580,7 @@ def batch_lme(
             size = jnp.maximum(expectations.size, 1.0)
             average = jnp.sum(expectations.log_likelihood) / size
             penalty = slack * jnp.sum(jnp.abs(point.weights)) + ridge / size / 2 * jnp.sum(point.weights**2)
-            return point.weights, average, average - penalty, point.iterations
+            return point.weights, average, average - penalty, point.iterations, point.converged
 
         # One start after another: memory stays that of one, and no start waits for the slowest.
         return lax.map(from_start, jax.random.split(key, restarts))
@@ -561,11 +588,11 @@ def batch_lme(
     def checked(key: Array, demonstration: Demonstration) -> BatchFit:
         key = as_key(key)
         demonstration = checked_demonstration(mdp, demonstration, needed_by="batch learning")
-        weights, average, objective, steps = (np.asarray(x) for x in fit(key, demonstration.bucketed()))
+        weights, average, objective, *counted = (np.asarray(x) for x in fit(key, demonstration.bucketed()))
         if not np.isfinite(objective).any():
             require_possible(sensor, mdp, demonstration)
             raise DemonstrationError("a trajectory has probability zero under every start")
         best = int(np.nanargmax(objective))
-        return BatchFit(weights[best], float(average[best]), objective, steps)
+        return BatchFit(weights[best] / scale, float(average[best]), objective, *counted)
 
     return Batch("batch LME", checked)

@@ -12,6 +12,10 @@ The dual is ``min_theta p0.V_theta - theta.phi_hat + sum_k slack_k |theta_k| + r
 slack of the constraints is the L1 penalty of the weights, as in the proofs of Theorems 1 and 3, where
 ``slack = epsilon / (1 - gamma)``. The conditional likelihood of visit counts has the same shape (a linear
 function of values and weights), and is solved by the same iterations.
+
+Every solver divides each feature by its scale first (:mod:`~i2rl.models.units`), and multiplies weights by
+it: ``slack`` and ``ridge`` penalise scaled weights, tolerances are relative to scaled features, and no answer
+depends on the units of a feature. Weights go in and come out as those of the features as given.
 """
 
 from __future__ import annotations
@@ -34,6 +38,7 @@ from ..models.planning import (
     reward_of,
     soft_plan,
 )
+from ..models.units import feature_scale, with_scaled_features
 from .maxent_constraints import FeatureTarget, failure, shaped_slack, shaped_target
 
 _MAX_ITERATIONS = 100
@@ -69,7 +74,7 @@ class Solution(NamedTuple):
     objective : float
         The minimised objective, penalties included (nats).
     residual : float
-        Violation of the optimality (KKT) conditions, relative to the scale of the features.
+        Violation of the optimality (KKT) conditions by scaled weights, relative to what was matched.
     iterations : int
         Newton iterations (gradient steps for the exponentiated gradient).
     converged : bool
@@ -110,9 +115,10 @@ def solve_dual(
     target : FeatureTarget
         Features to match and the distribution of the first state.
     slack : float or ``[K]``
-        ``beta_k >= 0``: how far expected features may be from the target (units of ``phi_hat``).
+        ``beta_k >= 0``: how far expected features may be from the target, in units of each feature's scale
+        (:func:`~i2rl.models.units.feature_scale`).
     ridge : float
-        Quadratic penalty on the weights.
+        Quadratic penalty on the scaled weights.
     start : WarmStart or None
         A previous solution (``solution.warm()``); zero weights by default.
 
@@ -123,13 +129,23 @@ def solve_dual(
     """
     require_discounted(mdp)
     features, initial = shaped_target(mdp, target)
-    return _minimise(
-        mdp,
-        _LinearObjective(initial, features),
-        shaped_slack(mdp, slack),
-        jnp.asarray(ridge, float),
-        start,
+    scale = feature_scale(mdp)
+    scaled = FeatureTarget(features / scale, initial)
+    return _unscaled(
+        solve_scaled_dual(with_scaled_features(mdp), scaled, slack, ridge, _scaled(start, scale)), scale
     )
+
+
+def solve_scaled_dual(
+    mdp: TabularMDP,
+    target: FeatureTarget,
+    slack: ArrayLike = 0.0,
+    ridge: ArrayLike = 0.0,
+    start: WarmStart | None = None,
+) -> Solution:
+    """Solve :func:`solve_dual`'s program for a process whose features are scaled already."""
+    objective = LinearObjective(jnp.asarray(target.start, float), jnp.asarray(target.features, float))
+    return minimise(mdp, objective, shaped_slack(mdp, slack), jnp.asarray(ridge, float), start)
 
 
 def fit_counts(
@@ -152,7 +168,7 @@ def fit_counts(
     counts : float ``[S, A]``
         ``N(s, a) >= 0``: (expected) visits; zero for unavailable pairs.
     slack, ridge : float or ``[K]``, float
-        Penalties, in nats.
+        Penalties on the scaled weights, in nats.
     start : WarmStart or None
         A previous solution; zero weights by default.
 
@@ -162,9 +178,31 @@ def fit_counts(
         For discount 1, or arrays of the wrong shape.
     """
     require_discounted(mdp)
-    return _minimise(
+    scale = feature_scale(mdp)
+    return _unscaled(
+        fit_scaled_counts(with_scaled_features(mdp), counts, slack, ridge, _scaled(start, scale)), scale
+    )
+
+
+def fit_scaled_counts(
+    mdp: TabularMDP,
+    counts: Float[Array, "S A"],
+    slack: ArrayLike = 0.0,
+    ridge: ArrayLike = 0.0,
+    start: WarmStart | None = None,
+) -> Solution:
+    """Solve :func:`fit_counts`'s program for a process whose features are scaled already."""
+    return minimise(
         mdp, count_objective(mdp, counts), shaped_slack(mdp, slack), jnp.asarray(ridge, float), start
     )
+
+
+def _scaled(start: WarmStart | None, scale: Float[Array, " K"]) -> WarmStart | None:
+    return None if start is None else start._replace(weights=jnp.asarray(start.weights, float) * scale)
+
+
+def _unscaled(solution: Solution, scale: Float[Array, " K"]) -> Solution:
+    return solution._replace(weights=solution.weights / scale)
 
 
 @jax.jit
@@ -178,7 +216,7 @@ def soft_values(
 # -- the objective, its derivatives -------------------------------------------------------------------
 
 
-class _LinearObjective(NamedTuple):
+class LinearObjective(NamedTuple):
     """``g(theta) = state_weights . V_theta - features . theta``; both programs have this shape.
 
     Its Hessian is ``sum_s x(s) Cov_{a ~ pi(.|s)} dQ(s, .)``, ``x`` the discounted occupancy that flows from
@@ -189,14 +227,14 @@ class _LinearObjective(NamedTuple):
     features: Float[Array, " K"]
 
 
-def count_objective(mdp: TabularMDP, counts: ArrayLike) -> _LinearObjective:
+def count_objective(mdp: TabularMDP, counts: ArrayLike) -> LinearObjective:
     """Minus the conditional log-likelihood: ``sum N (V - Q) = (n - gamma P'N).V - theta.sum N phi``."""
     counts = jnp.asarray(counts, float)
     if counts.shape != mdp.available.shape:
         raise ValueError(
             f"counts must have shape [S, A] = {list(mdp.available.shape)}, got {list(counts.shape)}"
         )
-    return _LinearObjective(
+    return LinearObjective(
         counts.sum(1) - mdp.discount * mdp.push_forward(counts),
         jnp.einsum("sa,sak->k", counts, mdp.features),
     )
@@ -212,7 +250,7 @@ class _Expansion(NamedTuple):
 
 
 def _expand(
-    mdp: TabularMDP, objective: _LinearObjective, weights: Float[Array, " K"], values: Float[Array, " S"]
+    mdp: TabularMDP, objective: LinearObjective, weights: Float[Array, " K"], values: Float[Array, " S"]
 ) -> _Expansion:
     q = mdp.features @ weights + mdp.discount * mdp.expect_next(values)
     policy = jax.nn.softmax(jnp.where(mdp.available, q, -jnp.inf), axis=1)
@@ -272,9 +310,9 @@ class _Trial(NamedTuple):
 
 
 @jax.jit
-def _minimise(
+def minimise(
     mdp: TabularMDP,
-    objective: _LinearObjective,
+    objective: LinearObjective,
     slack: Float[Array, " K"],
     ridge: Float[Array, ""],
     start: WarmStart | None,
@@ -426,8 +464,8 @@ def exponentiated_gradient(
     ``z`` of line 15 descends the likelihood (the dissertation's code has ``exp(-2c (E[phi] - phi_hat))``,
     the sign used here); and ``E[phi]`` of line 14 is exact, not an average of sampled trajectories.
 
-    Weights stay positive and sum to one. The solver therefore cannot express a negative weight, nor how
-    deterministic the expert is (the length of the weight vector), and for most experts no point of the
+    Scaled weights stay positive and sum to one. The solver therefore cannot express a negative weight, nor
+    how deterministic the expert is (the length of the weight vector), and for most experts no point of the
     simplex meets the stopping rule: it then ends after ``max_steps`` with ``converged`` false. Kept to
     replicate; :func:`solve_dual` solves the program the theorems are about.
 
@@ -436,11 +474,11 @@ def exponentiated_gradient(
     mdp, target
         As for :func:`solve_dual`.
     epsilon : float
-        Tolerance per step, ``epsilon`` of Theorem 1.
+        Tolerance per step, ``epsilon`` of Theorem 1, in units of each feature's scale.
     rate : float or None
-        ``eta``, per unit of discounted features; ``(1 - gamma) / 4`` by default.
+        ``eta``, per unit of discounted scaled features; ``(1 - gamma) / 4`` by default.
     start : float ``[K]`` or None
-        Weights of the previous session, all positive; uniform by default. Normalised before use.
+        Weights of the previous session, all positive; equal scaled weights by default. Normalised before use.
     max_steps : int
         Bound on the number of gradient steps.
 
@@ -452,13 +490,29 @@ def exponentiated_gradient(
     """
     require_discounted(mdp)
     features, initial = shaped_target(mdp, target)
+    scale = feature_scale(mdp)
+    scaled = FeatureTarget(features / scale, initial)
+    weights = None if start is None else jnp.asarray(start, float) * scale
+    solution = exponentiate_scaled(with_scaled_features(mdp), scaled, epsilon, rate, weights, max_steps)
+    return _unscaled(solution, scale)
+
+
+def exponentiate_scaled(
+    mdp: TabularMDP,
+    target: FeatureTarget,
+    epsilon: ArrayLike = 0.01,
+    rate: float | None = None,
+    start: Float[Array, " K"] | None = None,
+    max_steps: int = 10_000,
+) -> Solution:
+    """Run :func:`exponentiated_gradient` on a process whose features are scaled already."""
     weights = jnp.ones(mdp.n_features) if start is None else jnp.asarray(start, float)
     if not isinstance(weights, jax.core.Tracer) and not (np.asarray(weights) > 0).all():
         raise ValueError(
             f"the exponentiated gradient needs positive starting weights, got {np.asarray(weights)}"
         )
     step = (1 - mdp.discount) / 4 if rate is None else jnp.asarray(rate, float)
-    return _exponentiated_gradient(mdp, FeatureTarget(features, initial), epsilon, step, weights, max_steps)
+    return _exponentiated_gradient(mdp, target, epsilon, step, weights, max_steps)
 
 
 @jax.jit

@@ -7,11 +7,17 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 from scipy import optimize, sparse
 
-from ..models.mdp import TabularMDP
+from ..models.mdp import TabularMDP, _PairNames
 from ..models.planning import reachable_states, require_discounted
+from ..models.units import feature_scale, with_scaled_features
+
+# Constraints are met where scaled features miss by no more than this share of the largest.
+_MET = 1e-7
+# Discounted visits below this count as none.
+_LEAST_OCCUPANCY = 1e-4
 
 
 class ProgramNotSolved(RuntimeError):
@@ -143,11 +149,12 @@ def flow_constraints(mdp: TabularMDP, reachable: np.ndarray) -> FlowConstraints:
 def nearest_features(mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike = 0.0) -> np.ndarray:
     """Expected features ``[K]`` of some policy that violate the constraints least, by linear programming.
 
-    Minimises ``sum_k max(|E[phi_k] - phi_hat_k| - slack_k, 0)`` over all policies; the constraints can be
-    met exactly if that sum is zero.
+    Minimises ``sum_k max(|E[phi_k] - phi_hat_k| / scale_k - slack_k, 0)`` over all policies, with the
+    features' scales; the constraints can be met exactly if that sum is zero.
     """
     features, start, slack = checked_problem(mdp, target, slack)
-    flow = flow_constraints(mdp, reachable_states(mdp, start))
+    scale = np.asarray(feature_scale(mdp))
+    flow = flow_constraints(with_scaled_features(mdp), reachable_states(mdp, start))
     n, k = flow.features.shape
     beyond = -sparse.eye_array(k)
     result = optimize.linprog(
@@ -155,30 +162,84 @@ def nearest_features(mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike = 
         A_ub=sparse.vstack(
             [sparse.hstack([flow.features.T, beyond]), sparse.hstack([-flow.features.T, beyond])]
         ),
-        b_ub=np.concatenate([features + slack, slack - features]),
+        b_ub=np.concatenate([features / scale + slack, slack - features / scale]),
         A_eq=sparse.hstack([flow.balance, sparse.csr_array((len(flow.states), k))]),
         b_eq=start[flow.states],
         method="highs",
     )
     if not result.success:
         raise ProgramNotSolved(f"the feasibility program did not converge: {result.message}")
-    return result.x[:n] @ flow.features
+    return result.x[:n] @ flow.features * scale
+
+
+def excluded_pairs(
+    mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike = 0.0
+) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
+    """States and actions that every policy within the constraints avoids, though it gets to those states.
+
+    Weights are finite exactly where there are none: a soft policy takes every action. By linear programming,
+    for constraints that can be met: ``sum min(x(s, a), least)`` is maximised over occupancies ``x``.
+    """
+    features, start, slack = checked_problem(mdp, target, slack)
+    scale = np.asarray(feature_scale(mdp))
+    flow = flow_constraints(with_scaled_features(mdp), reachable_states(mdp, start))
+    n, k = flow.features.shape
+    least = _LEAST_OCCUPANCY
+    allowed = slack + _MET * (1 + np.abs(features / scale).max())
+    eye, nothing = sparse.eye_array(n), sparse.csr_array((k, n))
+    result = optimize.linprog(
+        np.concatenate([np.zeros(n), -np.ones(n)]),
+        A_ub=sparse.vstack(
+            [
+                sparse.hstack([flow.features.T, nothing]),
+                sparse.hstack([-flow.features.T, nothing]),
+                sparse.hstack([-eye, eye]),
+            ]
+        ),
+        b_ub=np.concatenate([features / scale + allowed, allowed - features / scale, np.zeros(n)]),
+        A_eq=sparse.hstack([flow.balance, sparse.csr_array((len(flow.states), n))]),
+        b_eq=start[flow.states],
+        bounds=[(0, None)] * n + [(0, least)] * n,
+        method="highs",
+    )
+    if not result.success:
+        raise ProgramNotSolved(f"the feasibility program did not converge: {result.message}")
+    x = result.x[:n]
+    visited = np.bincount(flow.row, x, len(flow.states))[flow.row] > least
+    avoided = visited & (result.x[n:] < least / 2)
+    return flow.pair_state[avoided], flow.pair_action[avoided]
 
 
 def failure(mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike, reason: str) -> Exception:
-    """The error to raise when a solver stopped with ``reason``: infeasible, and where, or merely unsolved."""
-    wanted, _, allowed = checked_problem(mdp, target, slack)
+    """The error to raise when a solver stopped with ``reason``: what it was that could not be solved.
+
+    :class:`InfeasibleProgram` names the features that no policy matches; :class:`ProgramNotSolved` names
+    actions that no policy within the constraints takes, whose avoidance needs infinite weights, if there are
+    any.
+    """
+    wanted, _, relative = checked_problem(mdp, target, slack)
+    scale = np.asarray(feature_scale(mdp))
+    allowed = relative * scale
     nearest = nearest_features(mdp, target, slack)
     beyond = np.abs(nearest - wanted) - allowed
-    missed = np.flatnonzero(beyond > 1e-7 * (1 + np.abs(wanted).max()))
-    if not len(missed):
+    missed = np.flatnonzero(beyond / scale > _MET * (1 + np.abs(wanted / scale).max()))
+    if len(missed):
+        worst = [
+            f"feature {_feature_name(mdp, k)} is to be {wanted[k]:.6g} within {allowed[k]:.3g}, "
+            f"the nearest is {nearest[k]:.6g}, {beyond[k]:.3g} beyond the slack"
+            for k in missed[np.argsort(-beyond[missed] / scale[missed])][:5]
+        ]
+        return InfeasibleProgram("no policy has the expected features asked for: " + "; ".join(worst))
+    states, actions = excluded_pairs(mdp, target, slack)
+    if not len(states):
         return ProgramNotSolved(
-            f"the maximum-entropy program was not solved ({reason}). Its constraints can be met, but perhaps "
-            "only by a deterministic policy, whose weights are infinite: a positive slack makes them finite"
+            f"the maximum-entropy program was not solved ({reason}). Some policy meets its constraints and "
+            "takes every action, so its weights are finite: a slack or a ridge makes it easier to solve"
         )
-    worst = [
-        f"feature {_feature_name(mdp, k)} is to be {wanted[k]:.6g} within {allowed[k]:.3g}, "
-        f"the nearest is {nearest[k]:.6g}, {beyond[k]:.3g} beyond the slack"
-        for k in missed[np.argsort(-beyond[missed])][:5]
-    ]
-    return InfeasibleProgram("no policy has the expected features asked for: " + "; ".join(worst))
+    name = _PairNames(mdp.labels)
+    avoided = "; ".join(name.pair(s, a) for s, a in zip(states[:5], actions[:5], strict=True))
+    more = f" and {len(states) - 5} more" if len(states) > 5 else ""
+    return ProgramNotSolved(
+        f"the maximum-entropy program was not solved ({reason}). Its weights are infinite: no policy that "
+        f"meets its constraints ever takes {avoided}{more}. A positive slack makes them finite"
+    )

@@ -8,12 +8,13 @@ import casadi as ca
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy import sparse
 
 from ..models.mdp import TabularMDP
-from ..models.planning import reachable_states, require_discounted
-from .maxent import count_objective, soft_values
+from ..models.planning import occupancy, reachable_states, require_discounted, reward_of, soft_plan
+from ..models.units import feature_scale, with_scaled_features
+from .maxent import LinearObjective, count_objective, minimise, soft_values
 from .maxent_constraints import FeatureTarget, ProgramNotSolved, checked_problem, checked_slack, failure
 
 _QUIET: dict[str, Any] = {
@@ -22,6 +23,7 @@ _QUIET: dict[str, Any] = {
     "print_time": False,
     "show_eval_warnings": False,
     "calc_lam_p": False,
+    "ipopt.max_iter": 200,
 }
 _COLD: dict[str, Any] = {**_QUIET, "ipopt.tol": 1e-9}
 # A previous session's solution lies on its bounds: without these, IPOPT would first push it back inside.
@@ -35,10 +37,20 @@ _WARM: dict[str, Any] = {
     "ipopt.warm_start_slack_bound_frac": 1e-10,
     "ipopt.warm_start_mult_bound_push": 1e-10,
 }
+# Weight of the proximal term, in shares of the discounted visits. The last one moves no weight that the
+# target determines by more than IPOPT's tolerance does, and holds the others where they started; larger ones
+# before it keep IPOPT from steps so long that every policy there is deterministic and says nothing.
+_PROXIMAL = 1e-10
+_STAGES = (1e-2, 1e-5, _PROXIMAL)
+# Where that term alone holds weights that the target pulls at by more than this share, they have no end.
+_HELD = 1e-7
 
 
 class IpoptPoint(NamedTuple):
-    """A primal-dual point: variables ``[2K + S]``, multipliers of their bounds and of the constraints."""
+    """A primal-dual point: variables ``[2K + S]``, multipliers of their bounds and of the constraints.
+
+    The first ``2K`` variables are the positive and negative parts of the scaled weights.
+    """
 
     variables: Float[np.ndarray, " n"]
     bound_multipliers: Float[np.ndarray, " n"]
@@ -58,6 +70,8 @@ class DualSolution(NamedTuple):
         The minimised objective at these weights, penalties included (nats).
     iterations : int
         Of IPOPT.
+    converged : bool
+        Whether IPOPT met its tolerance; what is returned to a caller has.
     warm : IpoptPoint
         Where to start the next session from.
     """
@@ -66,21 +80,35 @@ class DualSolution(NamedTuple):
     values: Float[np.ndarray, " S"]
     objective: float
     iterations: int
+    converged: bool
     warm: IpoptPoint
+
+
+class _Problem(NamedTuple):
+    """One problem in scaled features; constraints of ``pinned [S]`` states are equations."""
+
+    state_weights: Float[np.ndarray, " S"]
+    features: Float[np.ndarray, " K"]
+    slack: Float[np.ndarray, " K"]
+    ridge: float
+    pinned: Bool[np.ndarray, " S"]
 
 
 class _SoftBellmanProgram:
     """The program that both duals are instances of, built once per MDP::
 
-        minimise    w.V - theta.f + beta.(plus + minus) + ridge/2 |theta|^2,    theta = plus - minus
+        minimise    w.V - theta.f + beta.(plus + minus) + ridge/2 |theta|^2 + proximal/2 |theta - centre|^2
         subject to  lower(s) <= log sum_a exp(theta.phi(s, a) + gamma sum P V - V(s)) <= 0
 
-    ``w``, ``f``, ``beta`` and ``ridge`` are parameters, and ``lower`` is 0 or minus infinity.
+    with ``theta = plus - minus``, features ``phi`` scaled. All but ``phi`` and ``P`` are parameters, and
+    ``lower`` is 0 or minus infinity.
     """
 
     def __init__(self, mdp: TabularMDP) -> None:
         require_discounted(mdp)
         self.mdp = mdp
+        self._scale = np.asarray(feature_scale(mdp))
+        self._scaled = mdp = with_scaled_features(mdp)
         n_states, n_features = mdp.n_states, mdp.n_features
         state, action = np.nonzero(np.asarray(mdp.available))
         pair = np.arange(len(state))
@@ -95,52 +123,79 @@ class _SoftBellmanProgram:
         values = ca.SX.sym("V", n_states)
         state_weights, features = ca.SX.sym("w", n_states), ca.SX.sym("f", n_features)
         slack, ridge = ca.SX.sym("beta", n_features), ca.SX.sym("ridge")
+        proximal, centre = ca.SX.sym("proximal"), ca.SX.sym("centre", n_features)
         theta = plus - minus
         phi = ca.sparsify(ca.DM(np.asarray(mdp.features)[state, action]))
         advantage = phi @ theta + _matrix(float(mdp.discount) * following - at_state) @ values
         program = {
             "x": ca.vertcat(plus, minus, values),
-            "p": ca.vertcat(state_weights, features, slack, ridge),
+            "p": ca.vertcat(state_weights, features, slack, ridge, proximal, centre),
             "f": ca.dot(state_weights, values)
             - ca.dot(theta, features)
             + ca.dot(slack, plus + minus)
-            + ridge / 2 * ca.dot(theta, theta),
-            "g": ca.log(_matrix(at_state).T @ ca.exp(advantage)),
+            + ridge / 2 * ca.dot(theta, theta)
+            + proximal / 2 * ca.dot(theta - centre, theta - centre),
+            "g": _soft_maximum(advantage, state),
         }
-        self._origin = np.concatenate([np.zeros(2 * n_features), soft_values(mdp, jnp.zeros(n_features))])
+        # Strictly feasible: IPOPT leaves the boundary in directions that lead it far astray.
+        values = soft_values(mdp, jnp.zeros(n_features)) + 1 / (1 - mdp.discount)
+        self._origin = np.concatenate([np.zeros(2 * n_features), values])
         self._cold = ca.nlpsol("maxent_cold", "ipopt", program, _COLD)
         self._warm = ca.nlpsol("maxent_warm", "ipopt", program, _WARM)
 
-    def _run(
-        self,
-        state_weights: np.ndarray,
-        features: np.ndarray,
-        slack: np.ndarray,
-        ridge: float,
-        pinned: np.ndarray,
-        warm: IpoptPoint | None,
-    ) -> tuple[DualSolution, str]:
-        """Solve with the constraints of ``pinned [S]`` states held as equations; status '' means solved.
+    def _run(self, problem: _Problem, warm: IpoptPoint | None) -> tuple[DualSolution, str]:
+        """Solve from the first start that leads somewhere; status '' means solved.
 
-        A warm start that leads nowhere (the slack changed its pattern, say) is followed by a cold one.
+        A warm start that leads nowhere (the slack changed its pattern, say) is followed by cold ones: in one
+        go, then held by proximal terms that loosen, then from Newton's answer.
         """
-        solution, status = self._run_from(warm, state_weights, features, slack, ridge, pinned)
-        if status and warm is not None:
-            wasted = solution.iterations
-            solution, status = self._run_from(None, state_weights, features, slack, ridge, pinned)
-            solution = solution._replace(iterations=wasted + solution.iterations)
-        return solution, status
+        spent, status = 0, ""
+        for start in (self._from_warm, self._at_once, self._in_stages, self._from_newton):
+            found = start(problem, warm)
+            if found is None:
+                continue
+            solution, status = found
+            spent += solution.iterations
+            if not status:
+                break
+        return solution._replace(iterations=spent), status
 
-    def _run_from(
-        self,
-        warm: IpoptPoint | None,
-        state_weights: np.ndarray,
-        features: np.ndarray,
-        slack: np.ndarray,
-        ridge: float,
-        pinned: np.ndarray,
-    ) -> tuple[DualSolution, str]:
+    def _from_warm(self, problem: _Problem, warm: IpoptPoint | None) -> tuple[DualSolution, str] | None:
+        return None if warm is None else self._solve(problem, _PROXIMAL, warm)
+
+    def _at_once(self, problem: _Problem, warm: IpoptPoint | None) -> tuple[DualSolution, str]:
+        return self._solve(problem, _PROXIMAL, None)
+
+    def _in_stages(self, problem: _Problem, warm: IpoptPoint | None) -> tuple[DualSolution, str]:
+        point, spent = None, 0
+        for proximal in _STAGES:
+            solution, status = self._solve(problem, proximal, point)
+            point, spent = solution.warm, spent + solution.iterations
+            if status:
+                break
+        return solution._replace(iterations=spent), status
+
+    def _from_newton(self, problem: _Problem, warm: IpoptPoint | None) -> tuple[DualSolution, str]:
+        objective = LinearObjective(jnp.asarray(problem.state_weights), jnp.asarray(problem.features))
+        ridge = jnp.asarray(problem.ridge)
+        newton = minimise(self._scaled, objective, jnp.asarray(problem.slack), ridge, None)
+        weights, n_features = np.asarray(newton.weights), self.mdp.n_features
+        free = problem.slack == 0
+        parts = np.where(free, weights, np.maximum(weights, 0)), np.where(free, 0, np.maximum(-weights, 0))
+        # The multipliers of the Bellman inequalities are the discounted visits of each state.
+        policy = soft_plan(self._scaled, reward_of(self._scaled, newton.weights), newton.values).policy
+        visits = occupancy(self._scaled, policy, jnp.asarray(problem.state_weights)).sum(1)
+        point = IpoptPoint(
+            np.concatenate([*parts, newton.values]),
+            np.zeros(2 * n_features + self.mdp.n_states),
+            np.asarray(visits),
+        )
+        return self._solve(problem, _PROXIMAL, point)
+
+    def _solve(self, problem: _Problem, proximal: float, warm: IpoptPoint | None) -> tuple[DualSolution, str]:
+        """Solve from one start, with a proximal term of this share that is centred there."""
         n_states, n_features = self.mdp.n_states, self.mdp.n_features
+        state_weights, features, slack, ridge, pinned = problem
         # Without slack, plus and minus could grow together for nothing: plus alone is then the weight.
         free = slack == 0
         lower = np.concatenate(
@@ -149,23 +204,20 @@ class _SoftBellmanProgram:
         upper = np.concatenate(
             [np.full(n_features, np.inf), np.where(free, 0.0, np.inf), np.full(n_states, np.inf)]
         )
+        start = self._origin if warm is None else warm.variables
+        centre = start[:n_features] - start[n_features : 2 * n_features]
+        visits = state_weights.sum() / (1 - float(self.mdp.discount))
         arguments = {
-            "p": np.concatenate([state_weights, features, slack, [ridge]]),
+            "x0": start,
+            "p": np.concatenate([state_weights, features, slack, [ridge, proximal * visits], centre]),
             "lbx": lower,
             "ubx": upper,
             "lbg": np.where(pinned, 0.0, -np.inf),
             "ubg": np.zeros(n_states),
         }
-        if warm is None:
-            solver = self._cold
-            arguments["x0"] = self._origin
-        else:
-            solver = self._warm
-            arguments |= {
-                "x0": warm.variables,
-                "lam_x0": warm.bound_multipliers,
-                "lam_g0": warm.constraint_multipliers,
-            }
+        if warm is not None:
+            arguments |= {"lam_x0": warm.bound_multipliers, "lam_g0": warm.constraint_multipliers}
+        solver = self._cold if warm is None else self._warm
         result = solver(**arguments)
         statistics = solver.stats()
         point = IpoptPoint(*(np.asarray(result[name]).ravel() for name in ("x", "lam_x", "lam_g")))
@@ -173,15 +225,22 @@ class _SoftBellmanProgram:
         weights = plus - minus
         if statistics["success"]:
             # The barrier keeps V above its equation by mu / occupancy, which is much where nobody goes.
-            values = np.asarray(soft_values(self.mdp, jnp.asarray(weights), jnp.asarray(values)))
+            values = np.asarray(soft_values(self._scaled, jnp.asarray(weights), jnp.asarray(values)))
         objective = (
             state_weights @ values
             - features @ weights
             + slack @ np.abs(weights)
             + ridge / 2 * weights @ weights
         )
-        solution = DualSolution(weights, values, float(objective), int(statistics["iter_count"]), point)
-        return solution, "" if statistics["success"] else str(statistics["return_status"])
+        status = "" if statistics["success"] else str(statistics["return_status"])
+        held = proximal * visits * np.abs(weights - centre).max()
+        if not status and proximal == _PROXIMAL and held > _HELD * (1 + np.abs(features).max()):
+            status = "weights that grow without bound"
+        iterations = int(statistics["iter_count"])
+        return (
+            DualSolution(weights / self._scale, values, float(objective), iterations, not status, point),
+            status,
+        )
 
 
 class DualProgram(_SoftBellmanProgram):
@@ -210,12 +269,15 @@ class DualProgram(_SoftBellmanProgram):
     ) -> DualSolution:
         """Solve for a target, from ``warm`` (the previous session's) or from zero weights.
 
-        ``slack`` (a number or ``[K]``) is ``beta``, in units of the target's features. Raises
-        ``InfeasibleProgram`` naming the features that no policy can match, ``ProgramNotSolved`` when IPOPT
-        gives up, and ``ValueError`` for a malformed target.
+        ``slack`` (a number or ``[K]``) is ``beta``, in units of each feature's scale, and ``ridge`` penalises
+        scaled weights (:mod:`~i2rl.models.units`). Weights that the target does not determine stay close to
+        where they started. Raises ``InfeasibleProgram`` naming the features that no policy can match,
+        ``ProgramNotSolved`` when IPOPT gives up, naming actions whose avoidance needs infinite weights if
+        there are any, and ``ValueError`` for a malformed target.
         """
         features, start, beta = checked_problem(self.mdp, target, slack)
-        solution, status = self._run(start, features, beta, ridge, ~self._reachable(start), warm)
+        problem = _Problem(start, features / self._scale, beta, float(ridge), ~self._reachable(start))
+        solution, status = self._run(problem, warm)
         if status:
             raise failure(
                 self.mdp, target, slack, f"IPOPT reports {status} after {solution.iterations} iterations"
@@ -247,11 +309,12 @@ class CountProgram(_SoftBellmanProgram):
     ) -> DualSolution:
         """Solve for counts ``[S, A]``, from ``warm`` or zero weights; ``objective`` is minus the maximum.
 
-        Penalties are in nats. Raises ``ProgramNotSolved`` when IPOPT gives up, and ``ValueError`` for
-        counts that are negative, not finite, of unavailable pairs or of the wrong shape.
+        Penalties are in nats, of scaled weights (:mod:`~i2rl.models.units`). Raises ``ProgramNotSolved`` when
+        IPOPT gives up, and ``ValueError`` for counts that are negative, not finite, of unavailable pairs or
+        of the wrong shape.
         """
         visits = np.asarray(counts, float)
-        objective = count_objective(self.mdp, visits)
+        objective = count_objective(self._scaled, visits)
         if not (np.isfinite(visits) & (visits >= 0)).all():
             raise ValueError(f"counts must be finite and not negative; the least is {visits.min()}")
         stray = (visits > 0) & ~np.asarray(self.mdp.available)
@@ -260,11 +323,14 @@ class CountProgram(_SoftBellmanProgram):
             raise ValueError(
                 f"counts give {visits[s, a]} visits to the unavailable pair of state {s}, action {a}"
             )
-        everywhere = np.ones(self.mdp.n_states, bool)
-        solution, status = self._run(
-            np.asarray(objective.state_weights), np.asarray(objective.features),
-            checked_slack(self.mdp, slack), ridge, everywhere, warm,
-        )  # fmt: skip
+        problem = _Problem(
+            np.asarray(objective.state_weights),
+            np.asarray(objective.features),
+            checked_slack(self.mdp, slack),
+            float(ridge),
+            np.ones(self.mdp.n_states, bool),
+        )
+        solution, status = self._run(problem, warm)
         if status:
             raise ProgramNotSolved(
                 f"the count program was not solved: IPOPT reports {status} after {solution.iterations} "
@@ -272,6 +338,16 @@ class CountProgram(_SoftBellmanProgram):
                 "ridge makes them finite"
             )
         return solution
+
+
+def _soft_maximum(advantage: ca.SX, state: np.ndarray) -> ca.SX:
+    """``log sum_a exp(advantage)`` of each state, exponents shifted so that the largest is zero."""
+    maxima = []
+    for s in range(state[-1] + 1):
+        own = advantage[np.flatnonzero(state == s).tolist()]
+        largest = ca.mmax(own)
+        maxima.append(largest + ca.log(ca.sum1(ca.exp(own - largest))))
+    return ca.vertcat(*maxima)
 
 
 def _matrix(matrix: sparse.csc_array) -> ca.DM:

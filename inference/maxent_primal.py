@@ -13,6 +13,7 @@ from jaxtyping import Float
 
 from ..models.mdp import TabularMDP
 from ..models.planning import reachable_states, require_discounted
+from ..models.units import feature_scale, with_scaled_features
 from .maxent import soft_values
 from .maxent_constraints import FeatureTarget, checked_problem, failure, flow_constraints
 
@@ -48,6 +49,8 @@ class PrimalSolution(NamedTuple):
         The optimal discounted occupancy; it sums to ``1 / (1 - gamma)``.
     iterations : int
         Of the solver.
+    converged : bool
+        Whether the solver met its tolerances, rather than the reduced ones where rounding stopped it.
     """
 
     weights: Float[np.ndarray, " K"]
@@ -55,6 +58,7 @@ class PrimalSolution(NamedTuple):
     objective: float
     occupancy: Float[np.ndarray, "S A"]
     iterations: int
+    converged: bool
 
 
 class _Compiled(NamedTuple):
@@ -78,8 +82,9 @@ class PrimalProgram:
         subject to  sum_a x(s', a) = p0(s') + gamma sum P(s' | s, a) x(s, a)
                     | sum x phi_k - phi_hat_k | <= beta_k,    x >= 0
 
-    over available pairs of states reachable from ``p0``. ``phi_hat``, ``p0`` and ``beta`` are parameters:
-    the program is compiled at the first solve, and again only if other states become reachable.
+    over available pairs of states reachable from ``p0``, with features divided by their scales
+    (:mod:`~i2rl.models.units`). ``phi_hat``, ``p0`` and ``beta`` are parameters: the program is compiled at
+    the first solve, and again only if other states become reachable.
 
     Parameters
     ----------
@@ -95,19 +100,21 @@ class PrimalProgram:
         if solver not in _SETTINGS:
             raise ValueError(f"solver must be one of {', '.join(_SETTINGS)}, got {solver!r}")
         self.mdp = mdp
+        self._scale = np.asarray(feature_scale(mdp))
+        self._scaled = with_scaled_features(mdp)
         self.solver = solver
         self._compiled: dict[bytes, _Compiled] = {}
 
     def solve(self, target: FeatureTarget, slack: ArrayLike = 0.0) -> PrimalSolution:
         """Solve for a target.
 
-        ``slack`` (a number or ``[K]``) is ``beta``, in units of the target's features. Raises
+        ``slack`` (a number or ``[K]``) is ``beta``, in units of each feature's scale. Raises
         ``InfeasibleProgram`` naming the features that no policy can match, ``ProgramNotSolved`` when the
         solver gives up, and ``ValueError`` for a malformed target.
         """
         features, start, beta = checked_problem(self.mdp, target, slack)
         program = self._program(reachable_states(self.mdp, start))
-        program.features.value = features
+        program.features.value = features / self._scale
         program.start.value = start[program.states]
         program.slack.value = beta
         try:
@@ -122,17 +129,18 @@ class PrimalProgram:
         occupancy = np.zeros(self.mdp.available.shape)
         occupancy[program.pairs] = program.occupancy.value
         return PrimalSolution(
-            weights,
-            np.asarray(soft_values(self.mdp, jnp.asarray(weights))),
+            weights / self._scale,
+            np.asarray(soft_values(self._scaled, jnp.asarray(weights))),
             float(program.problem.value),
             occupancy,
             int(program.problem.solver_stats.num_iters or 0),
+            program.problem.status == cp.OPTIMAL,
         )
 
     def _program(self, reachable: np.ndarray) -> _Compiled:
         key = reachable.tobytes()
         if key not in self._compiled:
-            self._compiled[key] = _compile(self.mdp, reachable)
+            self._compiled[key] = _compile(self._scaled, reachable)
         return self._compiled[key]
 
 

@@ -21,6 +21,7 @@ from ..models.arguments import as_key
 from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted
+from ..models.units import feature_scale, with_scaled_features
 from .boltzmann import (
     BOX,
     ETA,
@@ -39,7 +40,7 @@ class MLIRLFit(NamedTuple):
     Fields
     ------
     weights : float ``[K]``
-        Of the best start, in ``[-1, 1]``.
+        Of the best start; scaled weights lie in ``[-1, 1]``.
     log_likelihood : float
         Of the whole demonstration, in nats, transition probabilities left out.
     objective : float ``[restarts]``
@@ -122,7 +123,9 @@ def mlirl(
     restarts: int = 5,
     iterations: int = 300,
 ) -> MLIRLFit:
-    """Maximum-likelihood IRL: the weights in ``[-1, 1]^K`` under which the demonstration is likeliest.
+    """Maximum-likelihood IRL: the weights under which the demonstration is likeliest.
+
+    Scaled weights (:mod:`~i2rl.models.units`) are looked for in ``[-1, 1]^K``.
 
     Parameters
     ----------
@@ -146,10 +149,11 @@ def mlirl(
     require_discounted(mdp)
     require_positive(eta=eta, restarts=restarts, iterations=iterations)
     counts = visit_counts(mdp, demonstration).sum(0)
-    ends = _climb(as_key(key), mdp, jnp.asarray(counts), jnp.asarray(float(eta)), restarts, iterations)
+    scaled = with_scaled_features(mdp)
+    ends = _climb(as_key(key), scaled, jnp.asarray(counts), jnp.asarray(float(eta)), restarts, iterations)
     best = int(np.argmax(ends.value))
     return MLIRLFit(
-        np.asarray(ends.weights[best]),
+        np.asarray(ends.weights[best] / feature_scale(mdp)),
         float(ends.value[best]),
         np.asarray(ends.value),
         np.asarray(ends.iterations),
@@ -261,7 +265,8 @@ def em_mlirl(
 
     Responsibilities ``v_{d,i} ~ rho_d prod_t pi_eta(a_t | s_t; theta_d)``; proportions are their means;
     weights climb the responsibility-weighted log-likelihood from where they were, so the marginal
-    log-likelihood never falls. Starts: weights uniform on the box, equal proportions.
+    log-likelihood never falls. Starts: weights uniform on the box, equal proportions. The box ``[-1, 1]^K``
+    is of scaled weights (:mod:`~i2rl.models.units`).
 
     Parameters
     ----------
@@ -288,6 +293,7 @@ def em_mlirl(
     """
     require_discounted(mdp)
     require_positive(clusters=clusters, eta=eta, iterations=iterations, restarts=restarts, ascents=ascents)
+    scale, scaled = feature_scale(mdp), with_scaled_features(mdp)
 
     def trace(key: Array, demonstration: Demonstration) -> EMTrace:
         counts = visit_counts(mdp, demonstration)
@@ -295,7 +301,7 @@ def em_mlirl(
         # Rows of padding would count for the proportions.
         real = demonstration.lengths > 0
         mixtures, responsibilities, history = _em(
-            as_key(key), mdp, jnp.asarray(counts[real]), jnp.asarray(float(eta)),
+            as_key(key), scaled, jnp.asarray(counts[real]), jnp.asarray(float(eta)),
             clusters, restarts, iterations, ascents,
         )  # fmt: skip
         best = int(np.argmax(history[:, -1]))
@@ -303,7 +309,7 @@ def em_mlirl(
         rows = np.broadcast_to(proportions, (len(real), clusters)).copy()
         rows[real] = responsibilities[best]
         clustering = Clustering(
-            np.asarray(mixtures.weights[best]), proportions, rows, float(history[best, -1])
+            np.asarray(mixtures.weights[best] / scale), proportions, rows, float(history[best, -1])
         )
         return EMTrace(clustering, np.asarray(history))
 

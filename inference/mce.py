@@ -29,6 +29,7 @@ from scipy import optimize
 
 from ..models.mdp import TabularMDP
 from ..models.planning import finite_hard_plan, finite_occupancy, finite_soft_plan, reward_of
+from ..models.units import feature_scale, with_scaled_features
 
 # Up to so many features Newton finishes what L-BFGS leaves: its Hessian costs K tangent sweeps.
 NEWTON_LIMIT = 64
@@ -51,7 +52,8 @@ class CausalEntropyFit(NamedTuple):
     weights : float ``[K]``
         Feature weights ``theta``, or the reward of every state (``K = S``).
     gap : float ``[K]``
-        What the policy collects minus what was asked for; at most the tolerance everywhere.
+        What the policy collects minus what was asked for; at most the tolerance everywhere, in units of the
+        features' scales.
     value : float
         The dual ``D(theta)``; at the optimum, the (discounted) causal entropy of the policy, in nats.
     evaluations : int
@@ -160,8 +162,9 @@ def fit_weights(
         ``phi_hat``, the expert's ``E[sum_{t < T} gamma^t phi(s_t, a_t)]``. From demonstrations of length
         ``T``: ``expectations(...).features / expectations(...).size``.
     tolerance : float
-        Largest gap left in any feature. For targets averaged over few demonstrations it is the slack of
-        the relaxed constraint: set it to the sampling error and the weights stay finite.
+        Largest gap left in any feature, in units of its scale (:mod:`~i2rl.models.units`). For targets
+        averaged over few demonstrations it is the slack of the relaxed constraint: set it to the sampling
+        error and the weights stay finite.
     start : float ``[K]``, optional
         Weights to start from (zeros); a previous session's make a warm start.
 
@@ -177,15 +180,20 @@ def fit_weights(
     weights = (
         np.zeros(mdp.n_features) if start is None else _vector("start", start, mdp.n_features, "features")
     )
+    scale, scaled = np.asarray(feature_scale(mdp)), with_scaled_features(mdp)
+    wanted = target / scale
     # A single sweep scatters faster than it gathers (twice, at 1024 states), and processes of one size then
     # share one compiled program. The Hessian, many sweeps side by side, keeps the gather: 6 times faster.
-    dual = partial(_evaluate, feature_dual, mdp.without_inflow(), target, horizon)
-    curvature = np.asarray(_feature_curvature(mdp.without_inflow(), weights, horizon))
-    fit = _lbfgs(dual, curvature, weights, tolerance)
+    dual = partial(_evaluate, feature_dual, scaled.without_inflow(), wanted, horizon)
+    curvature = np.asarray(_feature_curvature(scaled.without_inflow(), weights * scale, horizon))
+    fit = _lbfgs(dual, curvature, weights * scale, tolerance)
     if mdp.n_features <= NEWTON_LIMIT:
-        fit = _newton(dual, lambda w: np.asarray(_feature_hessian(mdp, w, target, horizon)), fit, tolerance)
+        fit = _newton(
+            dual, lambda w: np.asarray(_feature_hessian(scaled, w, wanted, horizon)), fit, tolerance
+        )
+    fit = fit._replace(weights=fit.weights / scale, gap=fit.gap * scale)
     _require_matched(
-        fit, target, tolerance, lambda k: f"feature {mdp.feature_names[k]!r}",
+        fit, target, tolerance * scale, lambda k: f"feature {mdp.feature_names[k]!r}",
         partial(_feature_range, mdp, horizon),
     )  # fmt: skip
     return fit
@@ -236,7 +244,7 @@ def fit_state_rewards(
     dual = partial(_evaluate, _state_dual, mdp.without_inflow(), target, horizon)
     fit = _lbfgs(dual, target, rewards, tolerance)
     _require_matched(
-        fit, target, tolerance, lambda s: f"state {mdp.state_names[s]!r}",
+        fit, target, np.full(mdp.n_states, tolerance), lambda s: f"state {mdp.state_names[s]!r}",
         partial(_visits_range, mdp, horizon),
     )  # fmt: skip
     return fit
@@ -351,19 +359,20 @@ def _visits_range(mdp: TabularMDP, horizon: int, s: int) -> tuple[Array, Array]:
 def _require_matched(
     fit: CausalEntropyFit,
     target: np.ndarray,
-    tolerance: float,
+    tolerance: np.ndarray,
     name: Callable[[int], str],
     attainable: Callable[[int], tuple[Array, Array]],
 ) -> None:
-    worst = int(np.abs(fit.gap).argmax())
-    if abs(fit.gap[worst]) <= tolerance:
+    worst = int((np.abs(fit.gap) / tolerance).argmax())
+    if abs(fit.gap[worst]) <= tolerance[worst]:
         return
     least, most = attainable(worst)
     wanted = f"{name(worst)} should reach {target[worst]:.6g}"
     if least <= target[worst] <= most:
         cause = (
             f"{wanted}, and is {abs(fit.gap[worst]):.3g} off after {fit.evaluations} evaluations; "
-            f"the target may contradict itself, or the tolerance {tolerance:g} be finer than the arithmetic"
+            f"the target may contradict itself, or the tolerance {tolerance[worst]:g} be finer than the "
+            "arithmetic"
         )
     else:
         cause = f"{wanted}, but lies between {least:.6g} and {most:.6g} under any policy"

@@ -34,8 +34,9 @@ from scipy.special import logsumexp, xlogy
 
 from ..models.mdp import TabularMDP
 from ..models.planning import require_discounted
+from ..models.units import feature_scale, with_scaled_features
 from .entropic import entropic_proportions
-from .maxent import WarmStart, fit_counts, soft_values
+from .maxent import WarmStart, fit_scaled_counts, soft_values
 from .maxent_constraints import ProgramNotSolved, flow_constraints
 
 _COLD: dict[str, Any] = {
@@ -69,7 +70,7 @@ class MinMaxPoint(NamedTuple):
     ------
     proportions : float ``[D]``
     parts : float ``[D, 2K]``
-        Positive and negative parts of the weights.
+        Positive and negative parts of the scaled weights.
     values : float ``[D, S]``
     proportion_multipliers, part_multipliers : float
         Of their bounds; ``[D]`` and ``[D, 2K]``.
@@ -146,6 +147,8 @@ class MinMaxProgram:
                 f"{components} components for {trajectories} trajectories: some would have none to explain"
             )
         self.mdp, self.components, self.trajectories = mdp, components, trajectories
+        self._scale = np.asarray(feature_scale(mdp))
+        self._scaled = mdp = with_scaled_features(mdp)
         self._flow = flow_constraints(mdp, np.ones(mdp.n_states, bool))
         n_states, n_features = mdp.n_states, mdp.n_features
         size, pairs = (trajectories, components), len(self._flow.pair_state)
@@ -203,7 +206,8 @@ class MinMaxProgram:
         strength : float
             ``lambda`` of the entropic prior on the proportions.
         l1, ridge : float or ``[K]``, float
-            Penalties of each component's weights, in nats in all (a Laplace and a Gaussian prior).
+            Penalties of each component's scaled weights (:mod:`~i2rl.models.units`), in nats in all (a
+            Laplace and a Gaussian prior).
         price : float
             What a nat of information of who did what costs, in nats of likelihood; more than zero.
         responsibilities : float ``[n, D]``
@@ -243,7 +247,7 @@ class MinMaxProgram:
         elif weights is not None:
             table = np.asarray(weights, float)
             self._check(table, (self.components, self.mdp.n_features), "weights", "[D, K]")
-            start = self._at(table, np.full(self.components, 1 / self.components))
+            start = self._at(table * self._scale, np.full(self.components, 1 / self.components))
         else:
             start = self._from_responsibilities(np.asarray(responsibilities, float), counts, penalties)
         solution, status = self._run(statistics, penalties, start, self._cold)
@@ -315,7 +319,7 @@ class MinMaxProgram:
         n_components, n_features = weights.shape
         if values is None:
             origin = jnp.zeros(self.mdp.n_states)
-            values = np.stack([soft_values(self.mdp, jnp.asarray(row), origin) for row in weights])
+            values = np.stack([soft_values(self._scaled, jnp.asarray(row), origin) for row in weights])
         return MinMaxPoint(
             proportions, np.concatenate([np.maximum(weights, 0), np.maximum(-weights, 0)], axis=1), values,
             np.zeros(n_components), np.zeros((n_components, 2 * n_features)), np.zeros_like(values), 0.0,
@@ -336,7 +340,9 @@ class MinMaxProgram:
         visits = np.broadcast_to(visits, (self.components, *visits.shape[-3:]))
         origin = WarmStart(jnp.zeros(self.mdp.n_features), jnp.zeros(self.mdp.n_states))
         fits = [
-            fit_counts(self.mdp, jnp.asarray(np.tensordot(shares[:, d], visits[d], 1)), l1, ridge, origin)
+            fit_scaled_counts(
+                self._scaled, jnp.asarray(np.tensordot(shares[:, d], visits[d], 1)), l1, ridge, origin
+            )
             for d in range(self.components)
         ]
         return self._at(
@@ -434,7 +440,7 @@ class MinMaxProgram:
         if solved:
             values = np.stack(
                 [
-                    soft_values(self.mdp, jnp.asarray(w), jnp.asarray(v))
+                    soft_values(self._scaled, jnp.asarray(w), jnp.asarray(v))
                     for w, v in zip(weights, values, strict=True)
                 ]
             )
@@ -445,7 +451,9 @@ class MinMaxProgram:
             evidence.sum() + price * strength * xlogy(pi, pi).sum()
             - (np.abs(weights) @ l1).sum() - ridge / 2 * (weights**2).sum()
         )  # fmt: skip
-        return MinMaxSolution(weights, values, pi, posterior, float(objective), iterations, point)
+        return MinMaxSolution(
+            weights / self._scale, values, pi, posterior, float(objective), iterations, point
+        )
 
 
 def _posterior(

@@ -10,6 +10,7 @@ The sound form of program (5.1). Given trajectories and, online, what is kept of
 (``n_d``, ``N_d``: mass and visits kept of earlier sessions). The E-step makes ``v_{d,i}`` proportional to
 ``pi_d P(X_i; theta_d)^(1/price)``; the M-steps are :func:`~.entropic.entropic_proportions` and one
 maximum-entropy program per way (:func:`~.maxent.fit_counts`). ``J`` never falls while the ways stay the same.
+Features are scaled (:mod:`~i2rl.models.units`), so penalties are of scaled weights.
 
 *How many ways.* With ``price`` 1, ``J`` is the likelihood of a mixture, and that cannot tell a sorter who
 flips a coin once and then sticks to it from two sorters who know what they want: the first costs ``log 2``
@@ -32,11 +33,11 @@ from ..models.mdp import TabularMDP
 from ..models.planning import reward_of, soft_plan
 from .entropic import entropic_proportions
 from .jumble import Jumble, explain_each
-from .maxent import WarmStart, fit_counts
+from .maxent import WarmStart, fit_scaled_counts
 
 
 class MixtureProgram(NamedTuple):
-    """What is being solved: see the module's formula.
+    """What is being solved: see the module's formula; features of ``mdp`` are scaled.
 
     The climb ends when ``J`` gains less than ``tolerance`` nats, or after ``iterations``.
     """
@@ -85,6 +86,8 @@ class Fit(NamedTuple):
     gain : float
         Of ``J`` in the last iteration.
     iterations, solver_iterations : int
+    converged : bool
+        Whether the programs of the last M-step met their tolerances.
     """
 
     mixture: Mixture
@@ -98,6 +101,7 @@ class Fit(NamedTuple):
     gain: Float[Array, ""]
     iterations: Int[Array, ""]
     solver_iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
 
 
 def nothing_kept(mdp: TabularMDP, ways: int) -> Kept:
@@ -205,23 +209,26 @@ def e_step(
     return Fit(
         mixture, kept, shares, _collected(shares, explained.visits), _collected(shares, explained.seen),
         assigned.log_likelihood, objective, jnp.array(-jnp.inf), objective - before, iterations,
-        solver_iterations,
+        solver_iterations, jnp.array(True),
     )  # fmt: skip
 
 
 def _m_step(
     program: MixtureProgram, kept: Kept, mixture: Mixture, mass: Float[Array, " D"], visits: Array
-) -> tuple[Mixture, Int[Array, ""]]:
-    """Proportions and rewards for the trajectories assigned to each way, kept ones included."""
+) -> tuple[Mixture, Int[Array, ""], Bool[Array, ""]]:
+    """Proportions and rewards for the trajectories assigned to each way, kept ones included.
+
+    With them the iterations of the solver, and whether every program met its tolerance.
+    """
 
     def reward(inputs: tuple) -> tuple:
         counts, *start = inputs
-        solution = fit_counts(program.mdp, counts, program.l1, program.ridge, WarmStart(*start))
-        return solution.weights, solution.values, solution.iterations
+        solution = fit_scaled_counts(program.mdp, counts, program.l1, program.ridge, WarmStart(*start))
+        return solution.weights, solution.values, solution.iterations, solution.converged
 
     fitted = lax.map(reward, (kept.visits + visits, mixture.weights, mixture.values))
     proportions = proportions_of(program, kept.mass + mass)
-    return Mixture(fitted[0], fitted[1], proportions), jnp.sum(fitted[2])
+    return Mixture(fitted[0], fitted[1], proportions), jnp.sum(fitted[2]), jnp.all(fitted[3])
 
 
 def climb(
@@ -236,10 +243,9 @@ def climb(
 
     def step(fit: Fit) -> Fit:
         mass = jnp.sum(fit.responsibilities, axis=0)
-        new, solved = _m_step(program, kept, fit.mixture, mass, fit.visits)
-        return e_step(
-            program, jumble, kept, new, fit.objective, fit.iterations + 1, fit.solver_iterations + solved
-        )
+        new, spent, converged = _m_step(program, kept, fit.mixture, mass, fit.visits)
+        counted = (fit.iterations + 1, fit.solver_iterations + spent)
+        return e_step(program, jumble, kept, new, fit.objective, *counted)._replace(converged=converged)
 
     def unfinished(fit: Fit) -> Bool[Array, ""]:
         return (fit.gain > program.tolerance) & (fit.iterations < program.iterations)
@@ -259,5 +265,6 @@ def unmade(
     nowhere, zero = jnp.array(-jnp.inf), jnp.zeros((), int)
     unknown = jnp.zeros(jumble.live.shape)
     return Fit(
-        mixture, kept, responsibilities, visits, visits, unknown, nowhere, nowhere, -nowhere, zero, zero
-    )
+        mixture, kept, responsibilities, visits, visits, unknown, nowhere, nowhere, -nowhere, zero, zero,
+        jnp.array(True),
+    )  # fmt: skip

@@ -32,6 +32,7 @@ from ..models.mixture import (
     stick_proportions,
     trajectory_log_likelihoods,
 )
+from ..models.occlusion import ScaledPrior
 from .mixture_problem import MixtureProblem, Start, in_threads, mixture_data, pose, resolve_jit, starts
 
 _CONCENTRATION_MOVES = 5
@@ -75,7 +76,7 @@ class Seated(NamedTuple):
 
 def reference_gaussian(prior: dist.Distribution) -> Reference:
     """The prior itself where it is normal, else a Gaussian of its middle and spread (any is exact)."""
-    bare = prior
+    bare = prior.base if isinstance(prior, ScaledPrior) else prior
     while isinstance(bare, dist.Independent | dist.ExpandedDistribution):
         bare = bare.base_dist
     size = prior.event_shape[0]

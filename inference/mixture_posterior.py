@@ -141,7 +141,7 @@ def sample_mixture_posterior(
     concentration : float or Distribution
         ``alpha``, or its prior.
     prior : Distribution, optional
-        Of each way's weights, see :func:`weights_prior`.
+        Of each way's scaled weights (:mod:`~i2rl.models.units`), see :func:`~i2rl.models.weights_prior`.
     draws, warmup, chains : int
         Draws kept and discarded by each chain, and number of chains.
     target_accept, max_tree_depth

@@ -30,7 +30,7 @@ from ..models.mixture import (
     soft_policies,
     truncation_error,
 )
-from ..models.occlusion import weights_prior
+from ..models.occlusion import scaled_prior
 from ..models.planning import require_discounted
 from ..version import __version__
 from .chains import in_threads as in_threads
@@ -219,7 +219,7 @@ def pose(
     require_possible(sensor, mdp, demonstration)
     demonstration = demonstration.select(present)
     perceived, rows = perceive(mdp, sensor, demonstration.codes)
-    prior = weights_prior(mdp.n_features, prior)
+    prior = scaled_prior(mdp, prior)
     alpha = concentration_prior(concentration)
     return MixtureProblem(mdp, sensor, perceived, jnp.asarray(rows), prior, alpha), demonstration, present
 

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..models.planning import hard_plan, reward_of, soft_plan
 from .jumble import Explained, Jumble, SeenWhole, explain, explain_each, without_reward
-from .maxent import WarmStart, count_information, fit_counts
+from .maxent import WarmStart, count_information, fit_scaled_counts
 from .mixture_fit import (
     Fit,
     Kept,
@@ -108,7 +108,8 @@ def _merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Arra
         nothing = _Trial(jnp.array(-jnp.inf), fit.mixture, kept, shares, visits)
 
         def refit() -> _Trial:
-            solution = fit_counts(mdp, together, program.l1, program.ridge, WarmStart(weights[a], values[a]))
+            start = WarmStart(weights[a], values[a])
+            solution = fit_scaled_counts(mdp, together, program.l1, program.ridge, start)
             proportion = proportions_of(program, kept.mass + jnp.sum(shares, axis=0))
             new = Mixture(
                 weights.at[a].set(solution.weights).at[b].set(0.0),

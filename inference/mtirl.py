@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -23,6 +23,7 @@ from ..models.demonstration import Demonstration, DemonstrationError
 from ..models.evidence import Imperfection, Sensor, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
 from ..models.planning import reachable_states, require_discounted
+from ..models.units import feature_scale, with_scaled_features
 from .clustering import Clustering
 from .jumble import Jumble, explain_each, is_seen_whole, seen_in_part, seen_whole
 from .lme import _digest
@@ -37,6 +38,7 @@ from .mixture_fit import (
     nothing_kept,
 )
 from .mixture_search import Search, search
+from .scaling import on_scaled_features
 from .session import Learner, in_plain_numbers
 
 DEFAULT_WAYS = 4
@@ -88,9 +90,11 @@ class MixtureReport(NamedTuple):
     demonstration_log_likelihood : float
         Exact log-likelihood of this session's trajectories under the mixture, dynamics included.
     gradient : float
-        Norm over all ways of the log-likelihood's gradient at the weights the session began with.
+        Norm over all ways of the log-likelihood's gradient in scaled weights at those the session began with.
     iterations, solver_iterations : int
         Of the alternation and of the programs' solver, in the start that was kept.
+    converged : bool
+        Whether the programs of its last alternation met their tolerances.
     seconds : float
     weights : float ``[D, K]``
     proportions : float ``[D]``
@@ -110,6 +114,7 @@ class MixtureReport(NamedTuple):
     gradient: float
     iterations: int
     solver_iterations: int
+    converged: bool
     seconds: float
     weights: Float[np.ndarray, "D K"]
     proportions: Float[np.ndarray, " D"]
@@ -153,7 +158,8 @@ def mme_mtirl(
         the likelihood's own price, right for people who err; less prefers several decided ways to one
         undecided.
     l1, ridge : float
-        Rate of a Laplace and precision of a Gaussian prior on each weight (nats in all, not per trajectory).
+        Rate of a Laplace and precision of a Gaussian prior on each scaled weight (nats in all, not per
+        trajectory), the reward in nats that a feature adds at most (:mod:`~i2rl.models.units`).
     restarts : int
         Seedings of the empty slots that are tried.
     iterations, tolerance : int, float
@@ -172,11 +178,26 @@ def mme_mtirl(
         For discount 1, fewer than one way, or settings that are negative or not finite.
     """
     sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
-    program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
-    configuration = {
-        "ways": ways, "strength": strength, "price": price, "l1": l1, "ridge": ridge, "restarts": restarts,
-        "iterations": iterations, "tolerance": tolerance, "sensor": _digest(sensor),
-    }  # fmt: skip
+
+    def build(mdp: TabularMDP) -> Learner:
+        program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
+        configuration = {
+            "ways": ways, "strength": strength, "price": price, "l1": l1, "ridge": ridge,
+            "restarts": restarts, "iterations": iterations, "tolerance": tolerance, "sensor": _digest(sensor),
+        }  # fmt: skip
+        return _learner(program, sensor, ways, restarts, configuration)
+
+    return on_scaled_features(mdp, build)
+
+
+def _learner(
+    program: MixtureProgram,
+    sensor: Imperfection,
+    ways: int,
+    restarts: int,
+    configuration: Mapping[str, Any],
+) -> Learner:
+    mdp = program.mdp
 
     def session(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
         jumble = seen_in_part(mdp, sensor, demonstration)
@@ -246,6 +267,8 @@ def batch_mme_mtirl(
     :func:`mme_mtirl` does.
     """
     sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
+    scale = np.asarray(feature_scale(mdp))
+    mdp = with_scaled_features(mdp)
     program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
     nothing, empty = nothing_kept(mdp, ways), empty_mixture(mdp, ways)
 
@@ -265,7 +288,7 @@ def batch_mme_mtirl(
         proportions = np.asarray(found.mixture.proportions)
         order = np.argsort(-proportions, kind="stable")[: np.count_nonzero(proportions)]
         return Clustering(
-            np.asarray(found.mixture.weights)[order],
+            np.asarray(found.mixture.weights)[order] / scale,
             proportions[order],
             np.asarray(found.responsibilities)[rows][:, order],
             float(found.objective),
@@ -417,6 +440,7 @@ def _conclude(
         "gradient": jnp.linalg.norm(jax.grad(known)(state.weights)),
         "iterations": fit.iterations,
         "solver_iterations": fit.solver_iterations,
+        "converged": fit.converged,
         "seconds": jnp.array(jnp.nan),
         "weights": fit.mixture.weights,
         "proportions": fit.mixture.proportions,

@@ -22,6 +22,7 @@ from ..models.demonstration import Demonstration
 from ..models.mdp import TabularMDP
 from ..models.occlusion import weights_prior
 from ..models.planning import require_discounted
+from ..models.units import feature_scale, with_scaled_features
 from ..version import __version__
 from .boltzmann import (
     BOX,
@@ -133,7 +134,9 @@ def birl(
     chains: int = 4,
     step: float = 0.1,
 ) -> az.InferenceData:
-    """Draw from the posterior over weights in ``[-1, 1]^K`` of one Boltzmann expert.
+    """Draw from the posterior over weights of one Boltzmann expert.
+
+    Scaled weights (:mod:`~i2rl.models.units`) lie in ``[-1, 1]^K``.
 
     Parameters
     ----------
@@ -143,12 +146,12 @@ def birl(
     eta : float
         Inverse temperature of the expert, per unit of value.
     prior : numpyro.distributions.Distribution, optional
-        Over ``K`` weights, or over one and taken for each; what it puts outside the box is cut off. Uniform
-        on the box by default.
+        Over ``K`` scaled weights, or over one and taken for each; what it puts outside the box is cut off.
+        Uniform on the box by default.
     draws, warmup, chains : int
         Draws kept and discarded by each chain, and number of chains, which start at draws of the prior.
     step : float
-        Width of the random walk at first; tuned during the warm-up and then fixed.
+        Width of the random walk of scaled weights at first; tuned during the warm-up and then fixed.
 
     Returns
     -------
@@ -175,8 +178,8 @@ def birl(
     walk: Walk = jax.tree.map(
         np.asarray,
         _walk(
-            as_key(key), mdp, jnp.asarray(counts), prior, jnp.asarray(float(eta)), jnp.asarray(float(step)),
-            chains, warmup, draws,
+            as_key(key), with_scaled_features(mdp), jnp.asarray(counts), prior, jnp.asarray(float(eta)),
+            jnp.asarray(float(step)), chains, warmup, draws,
         ),
     )  # fmt: skip
     if prior is not None and not np.isfinite(walk.lp[:, -1]).all():
@@ -184,7 +187,7 @@ def birl(
     attrs = {
         "inference_library": "i2rl",
         "i2rl_version": __version__,
-        "inference": "random-walk Metropolis-Hastings over weights in [-1, 1], Boltzmann likelihood",
+        "inference": "random-walk Metropolis-Hastings over scaled weights in [-1, 1], Boltzmann likelihood",
         "eta": float(eta),
         "mdp_fingerprint": mdp.fingerprint(),
         "prior": "Uniform(-1, 1)" if prior is None else f"{_described(prior)} on [-1, 1]",
@@ -192,7 +195,7 @@ def birl(
     }
     steps = ["trajectory", "step"]
     return az.from_dict(
-        posterior={"weights": walk.weights},
+        posterior={"weights": walk.weights / np.asarray(feature_scale(mdp))},
         sample_stats={x: getattr(walk, x) for x in ("lp", "acceptance_rate", "accepted", "step_size")},
         log_likelihood={"demonstration": walk.log_likelihood},
         observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},

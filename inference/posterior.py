@@ -28,7 +28,7 @@ from ..models.chain import filter_all, sample_backward
 from ..models.demonstration import PAD, UNKNOWN, Demonstration
 from ..models.evidence import Imperfection, checked_demonstration, fitting_sensor, require_possible
 from ..models.mdp import TabularMDP
-from ..models.occlusion import occlusion_model, weights_prior
+from ..models.occlusion import ScaledPrior, occlusion_model, scaled_prior
 from ..models.planning import require_discounted, reward_of, soft_plan
 from ..version import __version__
 from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
@@ -178,7 +178,7 @@ def gather(
     # A row of padding has probability one, whatever the weights.
     distinct = np.concatenate([distinct, np.broadcast_to([PAD, UNKNOWN, UNKNOWN], (spare, *codes.shape[1:]))])
     repeats = np.concatenate([repeats, np.ones(spare, int)])
-    prior = weights_prior(mdp.n_features, prior)
+    prior = scaled_prior(mdp, prior)
     return Problem(mdp, sensor, jnp.asarray(distinct, jnp.int32), jnp.asarray(repeats), prior), rows.ravel()
 
 
@@ -207,9 +207,10 @@ def sample_posterior(
     mdp, sensor, demonstration
         The decision process, how it was perceived, and what was perceived. Scores play no part.
     prior : numpyro.distributions.Distribution, optional
-        Over ``K`` weights, or over one and taken for each; ``Normal(0, 2.5)`` by default, see
-        :func:`weights_prior`. An expert who never errs is fitted ever better by ever larger weights: it is
-        the prior that ends this, and the weights' common scale depends on it.
+        Over ``K`` scaled weights (:mod:`~i2rl.models.units`), or over one and taken for each;
+        ``Normal(0, 2.5)`` by default, see :func:`~i2rl.models.weights_prior`. An expert who never errs is
+        fitted ever better by ever larger weights: it is the prior that ends this, and the weights' common
+        length depends on it.
     draws, warmup, chains : int
         Draws kept and discarded by each chain, and number of chains.
     completions : bool
@@ -344,6 +345,8 @@ def _fingerprint(tree: object) -> str:
 
 def _described(prior: dist.Distribution) -> str:
     """A distribution with its parameters, through the wrappers that only shape it."""
+    if isinstance(prior, ScaledPrior):
+        return f"{_described(prior.base)} on weights times {np.asarray(prior.scale).tolist()}"
     while hasattr(prior, "base_dist") and type(prior) in (dist.Independent, dist.ExpandedDistribution):
         prior = prior.base_dist
     values = (f"{name}={np.asarray(getattr(prior, name)).tolist()}" for name in prior.arg_constraints)

@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.typing import ArrayLike
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from ..models.arguments import as_key
 from ..models.demonstration import SEEN, Demonstration, DemonstrationError
@@ -50,7 +50,8 @@ from .perception import (
 )
 from .programs import host_solver
 from .reports import report_classes, report_log_evidence
-from .schedule import Schedule, described, require_slack_in
+from .scaling import on_scaled_features
+from .schedule import Schedule, described, require_slack, require_slack_in
 from .session import Learner, in_plain_numbers
 from .smoothing import Evidence, smooth_all
 from .statistic import blend, complete
@@ -118,6 +119,7 @@ class RIMEOReport(NamedTuple):
     gradient: float
     iterations: int
     solver_iterations: int
+    converged: bool
     seconds: float
     weights: Float[np.ndarray, " K"]
     reliabilities: Float[np.ndarray, " J"]
@@ -203,7 +205,7 @@ def rimeo(
     UserWarning
         Naming predicates that are the same for everything that can be reported, and so say nothing.
     """
-    method = _checked_method(mdp, view, statistic, slack, ridge)
+    seen = _checked_view(mdp, view, slack)
     psi = _checked_predicates(mdp, predicates, reportable, names)
     for name, value, options in (
         ("scores", scores, ("stepwise", "averaged", "none")),
@@ -228,13 +230,19 @@ def rimeo(
         "scores": scores, "truths": truths, "unscored": unscored, "solver": solver, "statistic": statistic,
         "slack": described(slack), "ridge": ridge, "errors": errors, "memory": memory,
         "start": np.asarray(start, float).tolist(), "iterations": iterations, "tolerance": tolerance,
-        "view": _digest(method.sensor), "predicates": _digest(_half_sure(psi, reportable)),
+        "view": _digest(seen), "predicates": _digest(_half_sure(psi, reportable)),
     }  # fmt: skip
     name = "RIMEO" if truths == "posterior" else f"RIMEO ({truths})"
-    return _learner(
-        name, method, perception, _half_sure(psi, reportable), configuration, _first_logits(psi, start),
-        memory, iterations, tolerance, solver, scores != "none" and not unscored,
-    )  # fmt: skip
+    first_logits = _first_logits(psi, start)
+
+    def build(mdp: TabularMDP) -> Learner:
+        method = _method(mdp, seen, statistic, "exact", slack, ridge, 0)
+        return _learner(
+            name, method, perception, _half_sure(psi, reportable), configuration, first_logits,
+            memory, iterations, tolerance, solver, scores != "none" and not unscored,
+        )  # fmt: skip
+
+    return on_scaled_features(mdp, build)
 
 
 def rifom(
@@ -258,7 +266,7 @@ def rifom(
     ``"coded"`` (as in the released program, see ``coded_perception``;
     predicates must then be true or false). Other parameters and errors as of :func:`rimeo`.
     """
-    method = _checked_method(mdp, view, statistic, slack, ridge)
+    seen = _checked_view(mdp, view, slack)
     psi = _checked_predicates(mdp, predicates, reportable, names)
     if form not in ("fair", "coded"):
         raise ValueError(f"form must be fair or coded, got {form!r}")
@@ -268,13 +276,19 @@ def rifom(
     perception = ways[form](report_classes(psi, reportable), psi)
     configuration = {
         "form": form, "statistic": statistic, "slack": described(slack), "ridge": ridge, "memory": memory,
-        "iterations": iterations, "tolerance": tolerance, "view": _digest(method.sensor),
+        "iterations": iterations, "tolerance": tolerance, "view": _digest(seen),
         "predicates": _digest(_half_sure(psi, reportable)),
     }  # fmt: skip
-    return _learner(
-        f"RIFOM ({form})", method, perception, _half_sure(psi, reportable), configuration,
-        _first_logits(psi, DEFAULT_START), memory, iterations, tolerance, "newton", False,
-    )  # fmt: skip
+    first_logits = _first_logits(psi, DEFAULT_START)
+
+    def build(mdp: TabularMDP) -> Learner:
+        method = _method(mdp, seen, statistic, "exact", slack, ridge, 0)
+        return _learner(
+            f"RIFOM ({form})", method, perception, _half_sure(psi, reportable), configuration,
+            first_logits, memory, iterations, tolerance, "newton", False,
+        )  # fmt: skip
+
+    return on_scaled_features(mdp, build)
 
 
 def robust_irl(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Batch:
@@ -292,15 +306,13 @@ def robust_irl(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Batch:
 # -- building blocks ----------------------------------------------------------------------------------
 
 
-def _checked_method(
-    mdp: TabularMDP, view: Imperfection | None, statistic: str, slack: Schedule, ridge: float
-) -> _Method:
+def _checked_view(mdp: TabularMDP, view: Imperfection | None, slack: Schedule) -> Imperfection:
     require_discounted(mdp)
+    require_slack(slack)
     seen = Sensor() if view is None else Sensor() * view
     if seen.reading is not None:
         raise ValueError("the view says what is hidden; how reports err is learned, not given")
-    seen = fitting_sensor(seen, mdp)
-    return _method(mdp, seen, statistic, "exact", slack, ridge, 0)
+    return fitting_sensor(seen, mdp)
 
 
 def _checked_predicates(
@@ -353,6 +365,7 @@ class _Point(NamedTuple):
     gradient: Float[Array, ""]
     iterations: Int[Array, ""]
     solver_iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
 
 
 class _Expected(NamedTuple):
@@ -379,7 +392,8 @@ class _Alternation(NamedTuple):
     def first(self, state: RIMEOState) -> _Point:
         zero, far = jnp.zeros((), int), jnp.array(jnp.inf)
         unknown = jnp.full_like(state.logits, 2.0)
-        return _Point(state.weights, state.values, state.logits, unknown, far, far, zero, zero)
+        unsolved = jnp.array(False)
+        return _Point(state.weights, state.values, state.logits, unknown, far, far, zero, zero, unsolved)
 
     def complete(
         self, session: PreparedSession, confidence: Array, plan: Any, logits: Array
@@ -418,7 +432,7 @@ class _Alternation(NamedTuple):
         return _Point(
             weights, jnp.asarray(solution.values), logits, agreement,
             jnp.maximum(_change(point.weights, weights), moved), expected.gradient, point.iterations + 1,
-            point.solver_iterations + solution.iterations,
+            point.solver_iterations + solution.iterations, jnp.asarray(solution.converged),
         )  # fmt: skip
 
     def close(
@@ -439,6 +453,7 @@ class _Alternation(NamedTuple):
             "gradient": point.gradient,
             "iterations": point.iterations,
             "solver_iterations": point.solver_iterations,
+            "converged": point.converged,
             "seconds": jnp.array(jnp.nan),
             "weights": point.weights,
             "reliabilities": jax.nn.sigmoid(point.logits),
@@ -564,7 +579,8 @@ def _outside(
             else:
                 logits = perception.fit(expected.reports, point.logits)
             reward = WarmStart(jnp.asarray(solution.weights), jnp.asarray(solution.values))
-            point = advance(point, expected, logits, _Solved(*reward, jnp.asarray(solution.iterations)))
+            counted = jnp.asarray(solution.iterations), jnp.asarray(solution.converged)
+            point = advance(point, expected, logits, _Solved(*reward, *counted))
         new, report = closing(state, prepared, confidence, point, ())
         return new._replace(program=(rewards, sensor)), report
 
@@ -575,6 +591,7 @@ class _Solved(NamedTuple):
     weights: Float[Array, " K"]
     values: Float[Array, " S"]
     iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
 
 
 def _checked_session(

@@ -49,12 +49,15 @@ class Report(NamedTuple):
         Exact log-likelihood (nats, hidden steps summed out, dynamics included) of this session's
         demonstration alone.
     gradient : float
-        Norm of the log-likelihood's gradient at the weights the session began with: how far this session's
-        data disagree with them. ``|phi_hat - E[phi]|`` (line 15 of Algorithm 1) with the features statistic.
+        Norm of the log-likelihood's gradient in scaled weights (:mod:`~i2rl.models.units`) at the weights the
+        session began with: how far this session's data disagree with them. ``|phi_hat - E[phi]|`` of scaled
+        features (line 15 of Algorithm 1) with the features statistic.
     iterations : int
         E- and M-steps.
     solver_iterations : int
         Iterations of the programs' solver, summed over the M-steps.
+    converged : bool
+        Whether the session's last program met its tolerance. True for a method that solves none.
     seconds : float
         Wall-clock time of the session.
     weights : float ``[K]``
@@ -67,6 +70,7 @@ class Report(NamedTuple):
     gradient: float
     iterations: int
     solver_iterations: int
+    converged: bool
     seconds: float
     weights: Float[np.ndarray, " K"]
 

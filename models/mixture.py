@@ -24,7 +24,7 @@ from .chain import filter_all
 from .demonstration import PAD, SEEN, UNKNOWN
 from .evidence import Imperfection, _log, checked_codes, fitting_sensor, observe, step_log_evidence
 from .mdp import TabularMDP
-from .occlusion import weights_prior
+from .occlusion import scaled_prior
 from .planning import reward_of, simulate, soft_plan
 from .trajectory import _Codes
 
@@ -294,7 +294,7 @@ def mixture_model(
     concentration : float or Distribution
         ``alpha``, or its prior (``Gamma(2, 2)``, say): the larger, the more ways.
     prior : Distribution, optional
-        Of each way's weights, see :func:`weights_prior`.
+        Of each way's scaled weights, see :func:`~i2rl.models.weights_prior`.
     n_trajectories, length : int, optional
         ``n`` and ``L``, needed only without ``codes``.
 
@@ -314,7 +314,7 @@ def mixture_model(
         sticks = numpyro.sample("sticks", dist.Beta(1.0, alpha).expand((components - 1,)).to_event(1))
         proportions = stick_proportions(sticks)
     proportions = numpyro.deterministic("proportions", proportions)
-    each = weights_prior(mdp.n_features, prior).expand((components,)).to_event(1)
+    each = scaled_prior(mdp, prior).expand((components,)).to_event(1)
     weights = numpyro.sample("weights", each)
     if isinstance(codes, Perceived):
         table = component_log_likelihoods(mdp, soft_policies(mdp, weights), codes)

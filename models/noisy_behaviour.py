@@ -17,7 +17,7 @@ from numpyro.handlers import scale as scaled
 
 from .evidence import FeatureNoise, Imperfection, Sensor
 from .mdp import TabularMDP
-from .occlusion import weights_prior
+from .occlusion import scaled_prior
 from .trajectory import TrajectoryLaw
 
 
@@ -87,7 +87,7 @@ def noisy_behaviour_model(
     n_trajectories, length : int, optional
         ``n`` and ``L``, needed only without ``codes``.
     prior, reliability_prior : Distribution, optional
-        See :func:`weights_prior` and :func:`reliabilities_prior`.
+        Of the scaled weights, see :func:`~i2rl.models.weights_prior`, and :func:`reliabilities_prior`.
     repeats : int ``[n]``, optional
         How many times each row of ``codes`` was perceived, if identical trajectories were gathered.
 
@@ -102,7 +102,7 @@ def noisy_behaviour_model(
         n_trajectories, length = codes.shape[0], codes.shape[1]
     if n_trajectories is None or length is None:
         raise ValueError("without codes the model simulates, and needs n_trajectories and length")
-    weights = numpyro.sample("weights", weights_prior(mdp.n_features, prior))
+    weights = numpyro.sample("weights", scaled_prior(mdp, prior))
     reliabilities = numpyro.sample(
         "reliabilities", reliabilities_prior(predicates.shape[0], reliability_prior)
     )

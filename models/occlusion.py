@@ -6,27 +6,35 @@ remains is a density over ``R^K`` that any NumPyro inference can take.
 
 from __future__ import annotations
 
+from typing import Any
+
+import jax.numpy as jnp
 import numpyro
 import numpyro.distributions as dist
-from jaxtyping import Array, Int
+from jaxtyping import Array, Bool, Float, Int
+from numpyro.distributions import constraints
+from numpyro.distributions.transforms import AffineTransform, ComposeTransform, Transform
 from numpyro.handlers import scale as scaled
 
 from .evidence import Imperfection
 from .mdp import TabularMDP
 from .trajectory import TrajectoryLaw
+from .units import feature_scale
 
-# A weight is a log-odds per unit of feature, as in logistic regression, and 2.5 is that model's customary
-# weakly informative scale: it admits experts who err once in hundreds of choices, not infinitely sure ones.
+# A scaled weight is a log-odds of at most that size, as in logistic regression with standardised inputs, and
+# 2.5 is that model's customary weakly informative scale: it admits experts who err once in hundreds of
+# choices, not infinitely sure ones.
 PRIOR_SCALE = 2.5
 
 
 def weights_prior(n_features: int, prior: dist.Distribution | None = None) -> dist.Distribution:
-    """The prior on weights as one distribution with event shape ``[K]``.
+    """The prior on scaled weights as one distribution with event shape ``[K]``.
 
-    ``None`` is ``Normal(0, PRIOR_SCALE)`` for each feature; a distribution over a scalar stands for itself,
-    independently for each feature (``Laplace(0, 1 / beta)`` is the prior whose mode meets the L1 penalty of
-    the relaxed maximum-entropy program); one over ``K`` numbers is taken as it is. Raises ``ValueError`` for
-    any other shape.
+    A scaled weight is the reward in nats that a feature adds at most (:mod:`.units`). ``None`` is
+    ``Normal(0, PRIOR_SCALE)`` for each feature; a distribution over a scalar stands for itself, independently
+    for each feature (``Laplace(0, 1 / beta)`` is the prior whose mode meets the L1 penalty of the relaxed
+    maximum-entropy program); one over ``K`` numbers is taken as it is. Raises ``ValueError`` for any other
+    shape.
     """
     if prior is None:
         prior = dist.Normal(0.0, PRIOR_SCALE)
@@ -39,6 +47,64 @@ def weights_prior(n_features: int, prior: dist.Distribution | None = None) -> di
             f"got batch shape {tuple(prior.batch_shape)} and event shape {tuple(prior.event_shape)}"
         )
     return prior.to_event(len(prior.batch_shape))
+
+
+class _Scaled(constraints.Constraint[Any]):
+    """Weights that times ``scale`` meet ``base``."""
+
+    def __init__(self, base: constraints.Constraint, scale: Float[Array, " K"]) -> None:
+        self.base, self.scale = base, scale
+
+    @property
+    def event_dim(self) -> int:
+        return self.base.event_dim
+
+    def __call__(self, x: Float[Array, "... K"]) -> Bool[Array, "..."]:
+        return self.base(x * self.scale)
+
+    def feasible_like(self, prototype: Float[Array, "... K"]) -> Float[Array, "... K"]:
+        return self.base.feasible_like(prototype) / self.scale
+
+    def tree_flatten(self) -> tuple:
+        return (self.base, self.scale), (("base", "scale"), {})
+
+
+@dist.biject_to.register(_Scaled)
+def _to_scaled(constraint: _Scaled) -> Transform:
+    # Samplers so move in scaled weights, whatever the units.
+    unscale = AffineTransform(0.0, 1 / constraint.scale, domain=constraints.real_vector)
+    return ComposeTransform([dist.biject_to(constraint.base), unscale])
+
+
+class ScaledPrior(dist.Distribution):
+    """The law of weights ``theta [K]`` whose scaled form ``theta * scale`` follows ``base``."""
+
+    pytree_data_fields = ("base", "scale")
+    reparametrized_params = ()
+
+    def __init__(self, base: dist.Distribution, scale: Float[Array, " K"]) -> None:
+        self.base, self.scale = base, jnp.asarray(scale)
+        super().__init__((), base.event_shape)
+
+    @property
+    def support(self) -> constraints.Constraint:
+        """Weights whose scaled form is in the base's support."""
+        return _Scaled(self.base.support, self.scale)
+
+    def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Float[Array, "... K"]:
+        """Draw weights."""
+        return self.base.sample(key, sample_shape) / self.scale
+
+    def log_prob(self, value: Float[Array, "... K"]) -> Float[Array, "..."]:
+        """Log-density of weights."""
+        return self.base.log_prob(value * self.scale) + jnp.sum(jnp.log(self.scale))
+
+
+def scaled_prior(mdp: TabularMDP, prior: dist.Distribution | None = None) -> ScaledPrior:
+    """The law of ``mdp``'s weights under a prior on scaled weights; see :func:`weights_prior`."""
+    if isinstance(prior, ScaledPrior):
+        return prior
+    return ScaledPrior(weights_prior(mdp.n_features, prior), feature_scale(mdp))
 
 
 def occlusion_model(
@@ -66,7 +132,7 @@ def occlusion_model(
     n_trajectories, length : int, optional
         ``n`` and ``L``, needed only without ``codes``.
     prior : Distribution, optional
-        See :func:`weights_prior`.
+        Of the scaled weights, see :func:`weights_prior`.
     repeats : int ``[n]``, optional
         How many times each row of ``codes`` was perceived, if identical trajectories were gathered: they
         have one likelihood, so this is the same model at less cost.
@@ -79,7 +145,7 @@ def occlusion_model(
         n_trajectories, length = codes.shape[0], codes.shape[1]
     if n_trajectories is None or length is None:
         raise ValueError("without codes the model simulates, and needs n_trajectories and length")
-    weights = numpyro.sample("weights", weights_prior(mdp.n_features, prior))
+    weights = numpyro.sample("weights", scaled_prior(mdp, prior))
     law = TrajectoryLaw(mdp, weights, sensor, length)
     with numpyro.plate("trajectory", n_trajectories), scaled(scale=1.0 if repeats is None else repeats):
         return numpyro.sample("demonstration", law, obs=codes)

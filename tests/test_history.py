@@ -55,7 +55,7 @@ def learner(mdp):
         weights = jnp.einsum("sa,sak->k", kept.counts, mdp.features)
         number = state.session + 1
         report = Report(number, -weights.sum(), -2 * weights.sum(), weights.max(), number, 3 * number,
-                        0.1 * number, weights)  # fmt: skip
+                        jnp.array(True), 0.1 * number, weights)  # fmt: skip
         return State(kept, number), report
 
     def init(key):

@@ -28,6 +28,7 @@ from i2rl.models import (
     sample_demonstration,
     soft_plan,
 )
+from i2rl.models.units import feature_scale
 
 TRUE = jnp.array([1.5, -2.0])
 
@@ -49,12 +50,13 @@ def demonstration(mdp, sensor):
 
 @pytest.fixture(scope="module")
 def objective(mdp):
-    """Penalised exact log-likelihood per trajectory, written without the learner."""
+    """Penalised exact log-likelihood per trajectory, written without the learner; slack is of scaled weights."""
+    scale = feature_scale(mdp)
 
     @jax.jit
     def value(weights, evidence, slack):
         policy = soft_plan(mdp, reward_of(mdp, weights)).log_policy
-        return jnp.mean(log_likelihoods(mdp, policy, evidence)) - slack * jnp.abs(weights).sum()
+        return jnp.mean(log_likelihoods(mdp, policy, evidence)) - slack * jnp.abs(weights * scale).sum()
 
     return value
 
@@ -177,7 +179,7 @@ def test_the_exponentiated_gradient_stays_on_the_simplex(mdp, sensor, demonstrat
     learner = lme_i2rl(mdp, sensor, statistic="features", solver="exponentiated gradient", iterations=2)
     state, _ = learner.update(learner.init(jax.random.key(0)), demonstration)
     assert np.all(np.asarray(state.weights) >= 0)
-    assert float(jnp.sum(state.weights)) == pytest.approx(1)
+    assert float(jnp.sum(state.weights * feature_scale(mdp))) == pytest.approx(1)
 
 
 def test_a_session_in_which_nothing_was_seen_is_allowed(mdp, sensor):
@@ -297,7 +299,7 @@ def test_every_solver_follows_a_schedule(mdp, sensor, demonstration):
     assert np.allclose(weights[0], weights[2], atol=2e-4)
     simplex = me_i2rl(mdp, solver="exponentiated gradient", statistic="features", slack=Harmonic(0.1))
     state, _ = simplex.update(simplex.init(jax.random.key(0)), Demonstration.from_pairs([[0]], [[1]]))
-    assert float(jnp.sum(state.weights)) == pytest.approx(1)
+    assert float(jnp.sum(state.weights * feature_scale(mdp))) == pytest.approx(1)
 
 
 def test_a_schedule_counts_each_streams_sessions_in_a_fleet(mdp, sensor, demonstration):

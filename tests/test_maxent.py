@@ -8,9 +8,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from i2rl.inference.maxent import (
+    LinearObjective,
     WarmStart,
     _expand,
-    _LinearObjective,
     count_objective,
     exponentiated_gradient,
     fit_counts,
@@ -38,6 +38,7 @@ from i2rl.models.planning import (
     reward_of,
     soft_plan,
 )
+from i2rl.models.units import feature_scale
 
 soft_policy = jax.jit(lambda mdp, weights: soft_plan(mdp, reward_of(mdp, weights)).policy)
 expected_features = jax.jit(feature_expectations)
@@ -188,7 +189,8 @@ def test_solutions_meet_the_optimality_conditions(seed, slack):
     target = expert_target(mdp, random_weights(seed))
     solution = solve_dual(mdp, target, slack)
     policy = soft_policy(mdp, solution.weights)
-    gap = expected_features(mdp, policy) - target.features
+    # Slack is in units of each feature's scale.
+    gap = (expected_features(mdp, policy) - target.features) / feature_scale(mdp)
     assert solution.converged
     assert (jnp.abs(gap) <= slack + 1e-6).all()
     # A constraint that is not tight has no multiplier; one that is pulls towards the target.
@@ -201,7 +203,7 @@ def test_enough_slack_leaves_no_reward_to_learn():
     mdp = problem(0)
     target = expert_target(mdp, random_weights(0))
     aimless = expert_target(mdp, np.zeros(3))
-    slack = jnp.abs(aimless.features - target.features) + 1e-3
+    slack = jnp.abs(aimless.features - target.features) / feature_scale(mdp) + 1e-3
     assert (solve_dual(mdp, target, slack).weights == 0).all()
     np.testing.assert_allclose(DualProgram(mdp).solve(target, slack).weights, 0, atol=1e-6)
     np.testing.assert_allclose(PrimalProgram(mdp).solve(target, slack).weights, 0, atol=1e-6)
@@ -215,7 +217,7 @@ def test_gradient_and_hessian_are_those_of_the_dual():
     def dual(w):
         return target.start @ soft_values(mdp, w) - target.features @ w
 
-    objective = _LinearObjective(target.start, target.features)
+    objective = LinearObjective(target.start, target.features)
     expansion = _expand(mdp, objective, weights, soft_values(mdp, weights))
     np.testing.assert_allclose(expansion.gradient, jax.grad(dual)(weights), rtol=1e-8)
     np.testing.assert_allclose(expansion.hessian, jax.hessian(dual)(weights), rtol=1e-8)
@@ -483,12 +485,12 @@ def test_flow_constraints_hold_for_the_occupancy_of_any_policy():
 
 def test_exponentiated_gradient_finds_an_expert_on_the_simplex():
     mdp = problem(2)
-    truth = jnp.array([0.2, 0.7, 0.1])
+    truth = jnp.array([0.2, 0.7, 0.1]) / feature_scale(mdp)
     target = expert_target(mdp, truth)
     solution = exponentiated_gradient(mdp, target, epsilon=1e-4)
     assert solution.converged
     assert solution.residual <= 1e-4
-    assert solution.weights.sum() == pytest.approx(1)
+    assert (feature_scale(mdp) * solution.weights).sum() == pytest.approx(1)
     np.testing.assert_allclose(solution.weights, truth, atol=0.1)
     better = exponentiated_gradient(mdp, target, epsilon=1e-8, start=solution.weights)
     np.testing.assert_allclose(better.weights, truth, atol=1e-5)

@@ -15,6 +15,7 @@ from i2rl.inference.maxent_constraints import ProgramNotSolved
 from i2rl.inference.maxent_dual import CountProgram
 from i2rl.inference.minmax import MinMaxProgram
 from i2rl.models.planning import reward_of, simulate, soft_plan
+from i2rl.models.units import feature_scale
 
 simulate_all = jax.jit(jax.vmap(simulate, in_axes=(0, None, 0, None)), static_argnums=3)
 
@@ -62,7 +63,8 @@ def objective_of(mdp, counts, weights, proportions, prior):
     mixed = proportions > 0
     log_proportions = jnp.log(jnp.where(mixed, proportions, 1.0))
     joint = jnp.where(mixed, log_proportions, -jnp.inf) + jnp.einsum("disa,dsa->id", counts, policies)
-    penalty = prior.l1 * jnp.abs(weights).sum() + prior.ridge / 2 * (weights**2).sum()
+    scaled = weights * feature_scale(mdp)
+    penalty = prior.l1 * jnp.abs(scaled).sum() + prior.ridge / 2 * (scaled**2).sum()
     entropic = prior.strength * (proportions * log_proportions).sum()
     return jax.nn.logsumexp(joint, axis=1).sum() + entropic - penalty, jax.nn.softmax(joint, axis=1)
 

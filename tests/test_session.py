@@ -36,7 +36,9 @@ from i2rl.models import (
 
 
 def report(session=1, log_likelihood=0.0, gradient=0.0, weights=(0.0,)):
-    return Report(session, log_likelihood, log_likelihood, gradient, 1, 1, 0.0, np.array(weights, float))
+    return Report(
+        session, log_likelihood, log_likelihood, gradient, 1, 1, True, 0.0, np.array(weights, float)
+    )
 
 
 @pytest.fixture(scope="module")

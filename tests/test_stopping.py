@@ -44,7 +44,7 @@ def reports():
     return [
         [
             Report(
-                int(i), likelihood[s, i - 1], 0.0, gradient[s, i - 1], 1, 1, 0.0, weights[s, i - 1]
+                int(i), likelihood[s, i - 1], 0.0, gradient[s, i - 1], 1, 1, True, 0.0, weights[s, i - 1]
             )
             for i in t
         ]
@@ -100,7 +100,7 @@ def test_a_window_longer_than_the_stream_never_stops(reports):
 
 def test_a_window_of_policies_waits_for_agreement(mdp):
     def report(*weights):
-        return Report(1, 0.0, 0.0, 0.0, 1, 1, 0.0, np.array(weights))
+        return Report(1, 0.0, 0.0, 0.0, 1, 1, True, 0.0, np.array(weights))
 
     stop = PolicyWindow(3, 0.0, mdp)
     same, opposite = report(1.0, -1.0), report(-1.0, 1.0)
