@@ -733,15 +733,13 @@ def _print_rewards(console: Console, names: Sequence[str], weights: ArrayLike, t
     rewards = np.atleast_2d(np.asarray(weights))
     table = Table(title=title)
     table.add_column("feature")
-    scales = [max(float(abs(weights).sum()), 1e-300) for weights in rewards]
+    scales = np.maximum(np.abs(rewards).sum(1), 1e-300)
     for i in range(len(rewards)):
         number = f" {i}" if len(rewards) > 1 else ""
         for column in (f"weight{number}", f"L1-normalised{number}"):
             table.add_column(column, justify="right")
-    for name, weights in zip(names, rewards.T, strict=True):
-        cells = [
-            x for w, scale in zip(weights, scales, strict=True) for x in (f"{w:.3f}", f"{w / scale:.3f}")
-        ]
+    for name, row in zip(names, rewards.T, strict=True):
+        cells = [x for w, scale in zip(row, scales, strict=True) for x in (f"{w:.3f}", f"{w / scale:.3f}")]
         table.add_row(for_terminal(name), *cells)
     console.print(table)
 

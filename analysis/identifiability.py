@@ -120,8 +120,8 @@ def identifiability_of(
         Where to look at the likelihood; the posterior mode under the prior ``Normal(0, 2.5)`` by default
         (the likelihood itself need not have a maximum).
     scale : float
-        How large scaled weights (:mod:`~i2rl.models.units`) are reasonably thought to be; the default is the
-        prior's standard deviation, so that a weakly determined direction is one of which the demonstration says less than the prior.
+        How large scaled weights (:mod:`~i2rl.models.units`) are reasonably thought to be. The default is the
+        prior's standard deviation: the demonstration says less than the prior of a weakly determined direction.
 
     Raises
     ------
@@ -255,9 +255,9 @@ def describe_identifiability(result: Identifiability) -> str:
     )
     lines = [head, *(f"- {line}" for line in lines)]
     if result.weak:
-        number = len(result.weak)
+        more = len(result.weak)
         lines.append(
-            f"{number} more {'is' if number == 1 else 'are'} weakly determined: the standard error exceeds "
+            f"{more} more {'is' if more == 1 else 'are'} weakly determined: the standard error exceeds "
             f"{result.scale:g}:"
         )
         lines += [
