@@ -203,7 +203,7 @@ class Forks:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._server = subprocess.Popen(
-            [sys.executable, "-m", __name__, "--serve", str(folder)],
+            [sys.executable, "-m", f"{__package__}.kills", "--serve", str(folder)],
             stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
             env={k: v for k, v in os.environ.items() if not k.startswith("JAX_")},
         )  # fmt: skip
