@@ -13,6 +13,7 @@ from .confusions import Confusions
 from .demonstration import (
     Demonstration,
     DemonstrationError,
+    LineLimits,
     Record,
     concatenate,
     read_trajectories,
@@ -62,6 +63,7 @@ __all__ = [
     "GaussianSensor",
     "HardPlan",
     "Imperfection",
+    "LineLimits",
     "MixtureLaw",
     "ObservationModel",
     "Record",
