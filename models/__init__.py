@@ -10,6 +10,7 @@ from .confusions import Confusions
 from .demonstration import (
     Demonstration,
     DemonstrationError,
+    LineLimits,
     Record,
     concatenate,
     read_trajectories,
@@ -59,6 +60,7 @@ __all__ = [
     "GaussianSensor",
     "HardPlan",
     "Imperfection",
+    "LineLimits",
     "MixtureLaw",
     "ObservationModel",
     "Record",

@@ -247,7 +247,7 @@ def test_impossible_observations_name_trajectory_step_and_reason(case):
     ],
 )
 def test_indices_out_of_range_are_named(state, action, message):
-    demo = Demonstration.from_pairs(np.array([state]), np.array([action]))
+    demo = Demonstration.from_codes(np.array([[[SEEN, state, action]]]))
     for sensor in (Sensor(), NOISY):
         with pytest.raises(DemonstrationError, match=message):
             require_possible(sensor, NAMED, demo)

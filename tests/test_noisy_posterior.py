@@ -114,7 +114,7 @@ def test_chains_start_in_both_modes_where_both_hold_something(toy):
     action = np.tile(np.arange(2), (3, 1))
     mdp = replace(toy, features=jnp.asarray(action[..., None] - 0.5))
     told = np.concatenate([np.zeros((90, 1), int), np.ones((10, 1), int)])
-    reports = Demonstration.from_pairs(np.full((100, 1), UNKNOWN), told)
+    reports = Demonstration.from_arrays(np.full((100, 1), UNKNOWN), told, missing=UNKNOWN)
     even, _ = noisy_problem(mdp, action[None], reports, reliability_prior=dist.Beta(1.0, 1.0))
     starts = noisy_starts(jax.random.key(0), even, 8)
     modes = np.array([noisy_mode(even, start.position).position for start in starts])
