@@ -463,8 +463,9 @@ def learn(
 
     from ..inference.journal import Journal
     from ..inference.lme import DEFAULT_SLACK, lme_i2rl
+    from ..models.demonstration import LineLimits
     from .quarantine import Quarantine
-    from .stream import Limits, learn_stream, open_lines
+    from .stream import learn_stream, open_lines
 
     with _reported_errors():
         process, sensor = _decision_process(mdp, observability)
@@ -478,7 +479,7 @@ def learn(
             {} if session_size == 1 else {"session_size": session_size}
         )
         learner = learner._replace(configuration={**learner.configuration, **stream})
-        limits = Limits(line_bytes, line_steps)
+        limits = LineLimits(line_bytes, line_steps)
         if quarantine is not None:
             _require_apart(quarantine, demos, journal)
         lines, source = open_lines(demos, follow, limits, skip=quarantine is not None, say=_say)

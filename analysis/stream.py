@@ -11,7 +11,6 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from io import FileIO
-from typing import NamedTuple
 
 from jaxtyping import Array
 
@@ -19,26 +18,21 @@ from ..inference.journal import Journal, JournalError, Position
 from ..inference.locking import Identity
 from ..inference.serialization import demonstration_digest
 from ..inference.session import Learner, Report
-from ..models.demonstration import DemonstrationError, Record, concatenate, read_trajectories
+from ..models.demonstration import (
+    DEFAULT_LIMITS,
+    DemonstrationError,
+    LineLimits,
+    Record,
+    concatenate,
+    read_trajectories,
+    too_long,
+)
 from ..models.mdp import TabularMDP
 from .quarantine import Line, Quarantine
 
 _PIECE = 1 << 16
 _HEAD = 1000
 _TAIL = 256
-
-
-class Limits(NamedTuple):
-    """The most that is read into memory of one line, and learned from in one trajectory.
-
-    Evidence about a step takes eight bytes a state and action; 10,000 steps of a patrol take 40 MB.
-    """
-
-    line_bytes: int = 1 << 22
-    line_steps: int = 10_000
-
-
-DEFAULT_LIMITS = Limits()
 
 
 # -- lines ------------------------------------------------------------------------------------------------
@@ -87,28 +81,26 @@ def _is_rewritten(file: FileIO, tail: bytes) -> bool:
 
 
 def read_lines(
-    pieces: Iterable[bytes], source: str, limits: Limits = DEFAULT_LIMITS, *, skip: bool = False
+    pieces: Iterable[bytes], source: str, limits: LineLimits = DEFAULT_LIMITS, *, skip: bool = False
 ) -> Iterator[Line]:
     """Put lines together from pieces that end where lines do, if not before.
 
-    No more than ``limits.line_bytes`` of a line are kept; with ``skip`` a longer one comes out with a fault,
+    No more than ``limits.size`` of a line are kept; with ``skip`` a longer one comes out with a fault,
     otherwise :class:`DemonstrationError` is raised as soon as it is too long.
     """
     line = _Unfinished(Position())
     for piece in pieces:
-        line.add(piece, limits.line_bytes)
-        if line.size > limits.line_bytes and not skip:
-            raise DemonstrationError(f"{source}, line {line.before.records + 1}: {_too_long(limits)}")
+        line.add(piece, limits.size)
+        if line.size > limits.size and not skip:
+            raise DemonstrationError(
+                f"{source}, line {line.before.records + 1}: {too_long(limits, line.size)}"
+            )
         if piece.endswith(b"\n"):
             finished = line.finished(limits)
             yield finished
             line = _Unfinished(finished.position)
     if line.size:
         yield line.finished(limits)
-
-
-def _too_long(limits: Limits) -> str:
-    return f"the line has more than {limits.line_bytes:,} bytes (the option --line-bytes allows more)"
 
 
 class _Unfinished:
@@ -131,10 +123,12 @@ class _Unfinished:
             self._hash.update(body)
         self._returns += len(piece.removesuffix(b"\n")) - len(body)
 
-    def finished(self, limits: Limits) -> Line:
+    def finished(self, limits: LineLimits) -> Line:
         position = Position(self.before.records + 1, self._hash.hexdigest())
-        if self.size > limits.line_bytes:
-            return Line(self.kept[:_HEAD].decode(errors="replace") + "...", position, _too_long(limits))
+        if self.size > limits.size:
+            return Line(
+                self.kept[:_HEAD].decode(errors="replace") + "...", position, too_long(limits, self.size)
+            )
         try:
             return Line(self.kept.decode(), position)
         except UnicodeDecodeError as error:
@@ -145,7 +139,7 @@ class _Unfinished:
 def open_lines(
     path: str,
     follow: bool,
-    limits: Limits = DEFAULT_LIMITS,
+    limits: LineLimits = DEFAULT_LIMITS,
     *,
     skip: bool = False,
     say: Callable[[str], None] | None = None,
@@ -213,7 +207,7 @@ def learn_stream(
     agent: int | None = None,
     source: str = "input",
     on_session: Callable[[Report], None] | None = None,
-    limits: Limits = DEFAULT_LIMITS,
+    limits: LineLimits = DEFAULT_LIMITS,
     quarantine: Quarantine | None = None,
 ) -> int:
     """Run a session per ``size`` trajectories of JSON Lines, committing each before the next begins.
@@ -273,7 +267,7 @@ class _Records:
         lines: Iterator[Line],
         mdp: TabularMDP,
         source: str,
-        limits: Limits,
+        limits: LineLimits,
         here: Position,
         quarantine: Quarantine | None,
     ) -> None:
@@ -286,8 +280,7 @@ class _Records:
         while not ended:
             texts, first = self._texts(), self.here.records + 1
             try:
-                for record in read_trajectories(texts, self._mdp, self._source, first_line=first):
-                    self._require_short(record)
+                for record in read_trajectories(texts, self._mdp, self._source, first, self._limits):
                     yield self._line, record
                 ended = True
             except DemonstrationError as error:
@@ -306,14 +299,6 @@ class _Records:
             if self._line.fault:
                 raise DemonstrationError(f"{self._source}, line {self.here.records}: {self._line.fault}")
             yield self._line.text
-
-    def _require_short(self, record: Record) -> None:
-        steps = int(record.demonstration.lengths.max())
-        if steps > self._limits.line_steps:
-            raise DemonstrationError(
-                f"{self._source}, line {record.line}: the trajectory has {steps:,} steps, more than "
-                f"{self._limits.line_steps:,} (the option --line-steps allows more)"
-            )
 
 
 def _ruled_out(collected: list[tuple[Line, Record]], error: Exception) -> list[tuple[Line, Record]]:

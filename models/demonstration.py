@@ -447,14 +447,15 @@ class LineLimits(NamedTuple):
 
     Fields
     ------
-    characters : int
-        Characters of a line. Parsing takes up to 30 bytes of memory for each; 4 Mi by default.
+    size : int
+        Bytes of a line, or characters where it comes as text. Parsing takes up to 30 bytes of memory for each;
+        4 Mi by default.
     steps : int
         Steps of a trajectory, or nodes of a bout; 10,000 by default. A learner's memory grows with them times
         states times actions.
     """
 
-    characters: int = 4 * 2**20
+    size: int = 4 * 2**20
     steps: int = 10_000
 
 
@@ -477,7 +478,7 @@ def parsed_lines(
 
     Bytes are decoded from UTF-8; a byte order mark may begin the first line of a file. Raises
     :class:`DemonstrationError` naming ``source`` and line for what is not JSON, and for lines longer than
-    ``limits.characters``; ``TypeError`` for what is not lines.
+    ``limits.size``; ``TypeError`` for what is not lines.
     """
     if isinstance(lines, str | bytes | PurePath):
         raise TypeError(f"lines must be an open file or a list of lines; got {shortened(lines)}")
@@ -485,11 +486,8 @@ def parsed_lines(
         where = f"{source}, line {number}"
         if not isinstance(line, str | bytes):
             raise TypeError(f"lines must be lines of text; got {shortened(line)} ({where})")
-        if len(line) > limits.characters:
-            raise DemonstrationError(
-                f"{where}: a line must have at most {limits.characters} characters; it has {len(line)}: "
-                "write shorter trajectories or raise the limit"
-            )
+        if len(line) > limits.size:
+            raise DemonstrationError(f"{where}: {too_long(limits, len(line))}")
         if isinstance(line, bytes):
             try:
                 line = line.decode()
@@ -534,7 +532,7 @@ def read_trajectories(
     (each by name or index; ``s`` or ``a`` may be missing if it was not perceived; ``score`` in [0, 1] is
     optional), ``"hidden"`` (looked, saw nothing) or ``null`` (a lost frame). Blank lines are skipped;
     ``first_line`` is the number of the first one, for a reader that starts midway. ``limits`` bounds the
-    characters and steps of a line, and so the memory that reading it takes. Raises
+    size and steps of a line, and so the memory that reading it takes. Raises
     :class:`DemonstrationError` naming ``source``, line and step.
     """
     names = _Names(mdp)
@@ -580,9 +578,17 @@ def require_few(count: int, what: str, where: str, limits: LineLimits) -> None:
     """Raise :class:`DemonstrationError` for more steps on a line than the limit."""
     if count > limits.steps:
         raise DemonstrationError(
-            f"{where}: a line must have at most {limits.steps} {what}; it has {count}: write shorter "
-            "trajectories or raise the limit"
+            f"{where}: a line must have at most {limits.steps:,} {what}; it has {count:,}: write shorter "
+            "trajectories or raise `LineLimits.steps` (--line-steps)"
         )
+
+
+def too_long(limits: LineLimits, size: int) -> str:
+    """Say that a line has more bytes than the limit, ``size`` of them at least."""
+    return (
+        f"a line must have at most {limits.size:,} bytes; it has {size:,} or more: write shorter trajectories "
+        "or raise `LineLimits.size` (--line-bytes)"
+    )
 
 
 def write_trajectories(

@@ -497,7 +497,7 @@ LONG = "x" * 10**6
         ('["hidden"]\x00', "not valid JSON at character 11"),
         ("\ufeff[]", "not valid JSON at character 1: Unexpected UTF-8 BOM"),
         (b'["\xff"]', "not UTF-8 text at byte 3"),
-        ("[" + "9" * 10**7, "a line must have at most 4194304 characters; it has 10000001"),
+        ("[" + "9" * 10**7, "a line must have at most 4,194,304 bytes; it has 10,000,001 or more"),
         ('{"steps": [' + "null," * 10**4 + 'null], "nodes": [' + "0," * 10**4 + "0]}", "field|at most 10000"),
         (f'["{LONG}"]', "a step is|a bout is"),
         (f'{{"{LONG}": 1, "nodes": [0], "steps": []}}', "unknown field '(nodes|steps)'"),
@@ -542,7 +542,7 @@ def test_limits_can_be_raised_and_lowered():
     assert read(line, limits=LineLimits(len(line), 20))[0].demonstration.kind.shape == (1, 20)
     with pytest.raises(DemonstrationError, match="at most 19 steps; it has 20: write shorter"):
         read(line, limits=LineLimits(len(line), 19))
-    with pytest.raises(DemonstrationError, match=f"at most {len(line) - 1} characters; it has {len(line)}"):
+    with pytest.raises(DemonstrationError, match=f"at most {len(line) - 1:,} bytes; it has {len(line):,}"):
         read(line, limits=LineLimits(len(line) - 1, 20))
 
 

@@ -27,9 +27,9 @@ def test_fuzzed_recordings_are_read_or_refused_by_row():
 
 
 def test_reading_a_line_takes_memory_in_proportion_to_the_limit():
-    limits = LineLimits(characters=2**17, steps=2000)
+    limits = LineLimits(size=2**17, steps=2000)
     peaks = fuzz.largest_lines(limits)
-    assert max(peaks.values()) < 30 * limits.characters
+    assert max(peaks.values()) < 30 * limits.size
     assert peaks["10 MB"] < 2**14
 
 

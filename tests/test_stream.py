@@ -14,10 +14,10 @@ from hypothesis import strategies as st
 
 from i2rl.analysis.benchmarks.kills import content, survive
 from i2rl.analysis.quarantine import Line, Quarantine
-from i2rl.analysis.stream import Limits, followed, learn_stream, open_lines, read_lines
+from i2rl.analysis.stream import followed, learn_stream, open_lines, read_lines
 from i2rl.inference.journal import Journal, JournalError, Position
 from i2rl.inference.lme import lme_i2rl
-from i2rl.models import DemonstrationError, TabularMDP, Visibility, concatenate, read_trajectories
+from i2rl.models import DemonstrationError, LineLimits, TabularMDP, Visibility, concatenate, read_trajectories
 from i2rl.models.storage import save_mdp
 
 KEY = jax.random.key(3)
@@ -233,19 +233,19 @@ def test_of_a_line_without_end_only_the_beginning_is_held():
         yield from itertools.repeat(b"x" * (1 << 16), count)
         yield from (b"\n", b"last\n")
 
-    limits = Limits(line_bytes=100_000)
+    limits = LineLimits(size=100_000)
     tracemalloc.start()
     found = list(read_lines(pieces(1000), "demos.jsonl", limits, skip=True))
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 1e6  # of 65 MB
     assert [line.text[:5] for line in found] == ["first", "xxxxx", "last\n"]
-    assert found[1].fault.startswith("the line has more than 100,000 bytes")
+    assert found[1].fault.startswith("a line must have at most 100,000 bytes")
     # Its position is that of the whole line, so that it may be read in another run that allows more.
-    more = list(read_lines(pieces(1000), "demos.jsonl", Limits(line_bytes=1 << 30)))
+    more = list(read_lines(pieces(1000), "demos.jsonl", LineLimits(size=1 << 30)))
     assert [line.position for line in more] == [line.position for line in found]
     with pytest.raises(
-        DemonstrationError, match=r"demos.jsonl, line 2: the line has more than 100,000 bytes \(.*--line"
+        DemonstrationError, match=r"demos.jsonl, line 2: a line must have at most 100,000 bytes; .*--line"
     ):
         list(read_lines(itertools.chain([b"first\n"], itertools.repeat(b"x" * 1000)), "demos.jsonl", limits))
 
@@ -253,10 +253,10 @@ def test_of_a_line_without_end_only_the_beginning_is_held():
 def test_a_trajectory_of_too_many_steps_is_refused_unless_it_is_allowed(learner, tmp_path):
     steps = json.dumps(["hidden"] * 5) + "\n"
     with pytest.raises(
-        DemonstrationError, match=r"input, line 1: the trajectory has 5 steps, more than 4 \(.*--line-st"
+        DemonstrationError, match=r"input, line 1: a line must have at most 4 steps; it has 5: .*--line-st"
     ):
-        learn(learner, [steps], tmp_path / "j", limits=Limits(line_steps=4))
-    assert learn(learner, [steps], tmp_path / "j", limits=Limits(line_steps=5)) == 1
+        learn(learner, [steps], tmp_path / "j", limits=LineLimits(steps=4))
+    assert learn(learner, [steps], tmp_path / "j", limits=LineLimits(steps=5)) == 1
 
 
 def test_a_line_cut_off_is_learned_once_it_is_whole(learner, lines, tmp_path):
@@ -308,7 +308,7 @@ BAD = [
     json.dumps(["hidden"] * 30) + "\n",
     JUMP,
 ]
-FEW = Limits(line_bytes=400, line_steps=20)
+FEW = LineLimits(size=400, steps=20)
 REASONS = [
     "not valid JSON", "unknown state 'attic'", "trajectory 0, step 1: ", "more than 400 bytes",
     "30 steps, more than 20", "trajectory [01], step 2: ",

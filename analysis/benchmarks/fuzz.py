@@ -245,7 +245,7 @@ def _fuzzed(
 
 def largest_lines(limits: LineLimits = DEFAULT_LIMITS) -> dict[str, int]:
     """Most memory allocated while reading lines of the size of the limit, in bytes, by what they hold."""
-    size, mdp = limits.characters, tiny_process()
+    size, mdp = limits.size, tiny_process()
     lines = {
         "steps within the limit": json.dumps([{"s": "bin", "a": 1, "score": 0.5}] * limits.steps),
         "empty lists": "[" + "[]," * (size // 3 - 1) + "[]]",
@@ -552,7 +552,7 @@ def main() -> None:
     )
     peaks = largest_lines()
     print_table(
-        f"Memory of reading one line (limit {DEFAULT_LIMITS.characters} characters)", ("line", "peak (MiB)"),
+        f"Memory of reading one line (limit {DEFAULT_LIMITS.size} characters)", ("line", "peak (MiB)"),
         [(name, peak / 2**20) for name, peak in peaks.items()],
     )  # fmt: skip
     print(f"The process grew from {before / 1024:.0f} to {resident / 1024:.0f} MiB while reading lines.")
