@@ -121,7 +121,7 @@ def identifiability_of(
         (the likelihood itself need not have a maximum).
     scale : float
         How large scaled weights (:mod:`~i2rl.models.units`) are reasonably thought to be. The default is the
-        prior's standard deviation: of a weakly determined direction the demonstration says less than the prior.
+        prior's standard deviation: of a weak direction the demonstration says less than the prior.
 
     Raises
     ------

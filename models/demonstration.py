@@ -448,8 +448,8 @@ class LineLimits(NamedTuple):
     Fields
     ------
     size : int
-        Bytes of a line, or characters where it comes as text. Parsing takes up to 30 bytes of memory for each;
-        4 Mi by default.
+        Bytes of a line, or characters where it comes as text; 4 Mi by default. Parsing takes up to 30 bytes of
+        memory for each.
     steps : int
         Steps of a trajectory, or nodes of a bout; 10,000 by default. A learner's memory grows with them times
         states times actions.
@@ -586,8 +586,8 @@ def require_few(count: int, what: str, where: str, limits: LineLimits) -> None:
 def too_long(limits: LineLimits, size: int) -> str:
     """Say that a line has more bytes than the limit, ``size`` of them at least."""
     return (
-        f"a line must have at most {limits.size:,} bytes; it has {size:,} or more: write shorter trajectories "
-        "or raise `LineLimits.size` (--line-bytes)"
+        f"a line must have at most {limits.size:,} bytes; it has {size:,} or more: write shorter "
+        "trajectories or raise `LineLimits.size` (--line-bytes)"
     )
 
 
