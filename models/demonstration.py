@@ -448,8 +448,8 @@ class LineLimits(NamedTuple):
     Fields
     ------
     size : int
-        Bytes of a line, or characters where it comes as text; 4 Mi by default. Parsing takes up to 30 bytes of
-        memory for each.
+        Bytes of a line, or characters where it comes as text; 4 Mi by default. Parsing takes up to 30 bytes
+        of memory for each.
     steps : int
         Steps of a trajectory, or nodes of a bout; 10,000 by default. A learner's memory grows with them times
         states times actions.
