@@ -77,14 +77,21 @@ def problem(seed: int, process: float, sensor: GaussianSensor, steps: int) -> Re
 
 @partial(jax.jit, static_argnames=("particles", "draws"))
 def particle_smoother(
-    key: Array, process: float, variance: float, reported: Recording, particles: int, draws: int
+    key: Array,
+    policy: Any,
+    process: float,
+    variance: float,
+    reported: Recording,
+    particles: int,
+    draws: int,
 ) -> Float[Array, "draws L 3"]:
     """Draw truths of a one-trajectory recording: bootstrap filter forward, simulation backward."""
     s_reported, a_reported = reported.observations[0], reported.actions[0]
     Q, R = process * jnp.eye(2), variance
 
     def act(key: Array, s: Float[Array, "N 2"]) -> Float[Array, "N 1"]:
-        return POLICY.moments(s)[0] + POLICY_VARIANCE**0.5 * jax.random.normal(key, (len(s), 1))
+        mean, covariance = policy.moments(s)
+        return mean + jnp.sqrt(covariance[:, 0]) * jax.random.normal(key, (len(s), 1))
 
     def weigh(s: Array, a: Array, s_report: Array, a_report: Array) -> Float[Array, " N"]:
         return log_normal(s_report - s, R * jnp.eye(2)) + log_normal(a_report - a, R * jnp.eye(1))
@@ -128,7 +135,7 @@ def particle_smoother(
 def by_particles(key: Array, process: float, variance: float, reported: Recording, options: Any) -> Moments:
     """The referee's moments."""
     drawn = np.asarray(
-        particle_smoother(key, process, variance, reported, options.particles, options.backward)
+        particle_smoother(key, POLICY, process, variance, reported, options.particles, options.backward)
     )
     return Moments(drawn.mean(0), drawn.std(0))
 
