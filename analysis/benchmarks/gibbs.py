@@ -87,14 +87,15 @@ def particle_smoother(
 ) -> Float[Array, "draws L 3"]:
     """Draw truths of a one-trajectory recording: bootstrap filter forward, simulation backward."""
     s_reported, a_reported = reported.observations[0], reported.actions[0]
-    Q, R = process * jnp.eye(2), variance
 
     def act(key: Array, s: Float[Array, "N 2"]) -> Float[Array, "N 1"]:
         mean, covariance = policy.moments(s)
         return mean + jnp.sqrt(covariance[:, 0]) * jax.random.normal(key, (len(s), 1))
 
     def weigh(s: Array, a: Array, s_report: Array, a_report: Array) -> Float[Array, " N"]:
-        return log_normal(s_report - s, R * jnp.eye(2)) + log_normal(a_report - a, R * jnp.eye(1))
+        return log_normal(s_report - s, variance * jnp.eye(2)) + log_normal(
+            a_report - a, variance * jnp.eye(1)
+        )
 
     def forward(carry: tuple, inputs: tuple) -> tuple:
         s, a = carry
@@ -114,19 +115,20 @@ def particle_smoother(
     inputs = (jax.random.split(walk, len(s_reported)), s_reported, a_reported)
     passed: tuple = lax.scan(forward, (s, act(choose, s)), inputs)[1]
     states, actions, log_w = passed
+    following_states = jax.vmap(PENDULUM.next_state)(states[:-1], actions[:-1])
 
     def draw(key: Array, final: Array) -> Float[Array, "L 3"]:
         def backward(following: Array, inputs: tuple) -> tuple:
-            key, s, a, w = inputs
-            here = jax.random.categorical(key, w + log_normal(following - PENDULUM.next_state(s, a), Q))
+            key, s, a, w, onward = inputs
+            distance = jnp.sum((following - onward) ** 2, -1)
+            here = jax.random.categorical(key, w - 0.5 * distance / process)
             return s[here], jnp.concatenate([s[here], a[here]])
 
         end = jax.random.categorical(final, log_w[-1])
         keys = jax.random.split(key, len(states) - 1)
-        before = lax.scan(
-            backward, states[-1, end], (keys, states[:-1], actions[:-1], log_w[:-1]), reverse=True
-        )
-        return jnp.concatenate([before[1], jnp.concatenate([states[-1, end], actions[-1, end]])[None]])
+        earlier = (keys, states[:-1], actions[:-1], log_w[:-1], following_states)
+        before: Array = lax.scan(backward, states[-1, end], earlier, reverse=True)[1]
+        return jnp.concatenate([before, jnp.concatenate([states[-1, end], actions[-1, end]])[None]])
 
     given = (jax.random.split(back, draws), jax.random.split(last, draws))
     return lax.map(lambda keys: draw(*keys), given, batch_size=64)
