@@ -6,12 +6,17 @@ present value, and accepted by the exact densities; the reverse proposal has its
 odd steps the even ones are independent, and given the states so are the actions, so a sweep is three updates
 of everything at once. With affine dynamics and policy every proposal is accepted.
 
-Neighbours that follow each other closely (small ``Q``) move each other slowly: the smoother of
-:mod:`.gaussian_truth` is the default, and this its check. Bounds are not imposed here.
+Neighbours that follow each other closely (small ``Q``) move each other slowly, however many proposals are
+accepted. So chains start about the posterior of :mod:`.gaussian_truth`'s smoother, each from its own draw and
+further out, and every sweep also moves whole trajectories: by steps that would leave the smoother's posterior
+as it is (preconditioned Crank-Nicolson; Cotter et al. 2013), accepted by how the exact posterior differs from
+it. Steps that hardly move all the same are a warning. The smoother is the default, and this its check. Bounds
+are not imposed here.
 """
 
 from __future__ import annotations
 
+import warnings
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -19,28 +24,78 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.scipy.linalg import cho_solve, solve_triangular
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Int
 
+from ..models.arguments import as_key
 from ..models.sensing import GaussianSensor, Recording, Truths, log_normal, truths
-from .gaussian_truth import GaussianTruth, JaxDynamics, Model, policy_moments
+from .gaussian_truth import (
+    GaussianTruth,
+    JaxDynamics,
+    Model,
+    TruthChain,
+    _draw,
+    _log_density,
+    log_joint,
+    policy_moments,
+)
+from .kalman import GaussianFiltered
+
+FIRST_PASSES = 6
+"""Of the smoother before the first sweep; one before every later refresh."""
+
+DISPERSION = 2.0
+"""Times as far from the smoother's means as its own draws are where chains start."""
+
+STRIDES = (1.0, 0.5, 0.15)
+"""Of a sweep's moves of whole trajectories, as a share of the smoother's posterior; 1 is a fresh draw."""
+
+FROZEN = 0.01
+"""Mobility below which a step counts as frozen."""
 
 
 class GibbsChain(NamedTuple):
-    """The reports, ``M`` draws of the truth, and how many proposals were accepted.
+    """The reports, ``M`` draws of the truth, and how they moved.
 
     Fields
     ------
     reported : Recording
+    smoothed : TruthChain
+        The smoother's, about which chains start and move as a whole.
     observations, actions : float ``[M, n, L, d]``, ``[M, n, L, k]``
-    accepted, proposed : float
-        Counted since ``init``.
+    accepted : float ``[2, n, L]``
+        Accepted proposals of each state and of each action since ``init``, over all chains.
+    accepted_whole : float ``[n]``
+        Accepted moves of whole trajectories, likewise.
+    sweeps : int
+        Since ``init``.
+    mobility : float ``[n, L]``
+        Mean square by which the last refresh moved each step (over chains and components), in units of what
+        independent draws of the smoother's posterior would; NaN on padding and before the first refresh.
     """
 
     reported: Recording
+    smoothed: TruthChain
     observations: Float[Array, "M n L d"]
     actions: Float[Array, "M n L k"]
-    accepted: Float[Array, ""]
-    proposed: Float[Array, ""]
+    accepted: Float[Array, "2 n L"]
+    accepted_whole: Float[Array, " n"]
+    sweeps: Int[Array, ""]
+    mobility: Float[Array, "n L"]
+
+    @property
+    def acceptance(self) -> Float[Array, "2 n L"]:
+        """Share of the proposals of each state and action that was accepted; NaN on padding."""
+        return jnp.where(self.reported.live, self.accepted / (self.sweeps * len(self.observations)), jnp.nan)
+
+    @property
+    def acceptance_whole(self) -> Float[Array, " n"]:
+        """Share of the moves of each whole trajectory that was accepted."""
+        return self.accepted_whole / (self.sweeps * len(self.observations) * len(STRIDES))
+
+    @property
+    def least_acceptance(self) -> Float[Array, ""]:
+        """Least share over all steps."""
+        return jnp.nanmin(self.acceptance)
 
 
 class _Blanket(NamedTuple):
@@ -204,28 +259,132 @@ class GaussianGibbs(NamedTuple):
     truth: GaussianTruth
     sweeps: int = 10
 
-    def init(self, reported: Recording, sensor: GaussianSensor | None = None) -> GibbsChain:
-        """Every chain starts at the reports, whatever the sensor."""
-        del sensor
-        shape = (self.truth.draws, 1, 1, 1)
+    def init(self, reported: Recording, sensor: GaussianSensor) -> GibbsChain:
+        """Start at the reports; the first refresh, which knows the policy, starts the chains.
+
+        Raises as :meth:`GaussianTruth.init` does.
+        """
+        smoothed = self.truth.init(reported, sensor)
+        rows, shape = reported.live.shape, (self.truth.draws, 1, 1, 1)
         return GibbsChain(
             reported,
+            smoothed,
             jnp.tile(reported.observations, shape),
             jnp.tile(reported.actions, shape),
-            jnp.zeros(()),
-            jnp.zeros(()),
+            jnp.zeros((2, *rows)),
+            jnp.zeros(rows[0]),
+            jnp.zeros((), int),
+            jnp.full(rows, jnp.nan),
         )
 
     def refresh(
         self, chain: GibbsChain, policy: Any, key: Array, sensor: GaussianSensor
     ) -> tuple[GibbsChain, Truths]:
-        """``sweeps`` sweeps: even states, odd states, actions."""
-        t = self.truth
+        """``sweeps`` sweeps: even states, odd states, actions, whole trajectories.
+
+        Warns of steps that hardly moved (:attr:`GibbsChain.mobility` below ``FROZEN``).
+        """
+        t, key = self.truth, as_key(key)
         sensor = sensor.sized(chain.observations.shape[-1], chain.actions.shape[-1])
+        first = not chain.sweeps
+        smoothed, filtered = t.smooth(chain.smoothed, policy, sensor, FIRST_PASSES if first else 1)
+        chain = chain._replace(smoothed=smoothed)
+        if first:
+            key, begin = jax.random.split(key)
+            chain = _dispersed(chain, _draw(begin, filtered, t.draws))
+        before = chain
         sweep = _compiled_sweep if isinstance(t.dynamics, JaxDynamics) else _sweep
         for key_sweep in jax.random.split(key, self.sweeps):
-            chain = sweep(t.dynamics, t.model, policy, sensor, chain, key_sweep)
+            key_steps, key_whole = jax.random.split(key_sweep)
+            chain = sweep(t.dynamics, t.model, policy, sensor, chain, key_steps)
+            chain = _move_whole(t, policy, sensor, filtered, chain, key_whole)
+        chain = chain._replace(sweeps=chain.sweeps + self.sweeps, mobility=_mobility(before, chain))
+        _warn_of_frozen(np.asarray(chain.mobility))
         return chain, truths(chain.reported, chain.observations, chain.actions)
+
+
+def _pairs(chain: GibbsChain) -> Float[Array, "M n L D"]:
+    return jnp.concatenate([chain.observations, chain.actions], -1)
+
+
+def _with_pairs(chain: GibbsChain, pairs: Float[Array, "M n L D"]) -> GibbsChain:
+    d = chain.observations.shape[-1]
+    moved = jnp.where(chain.reported.live[..., None], pairs, _pairs(chain))
+    return chain._replace(observations=moved[..., :d], actions=moved[..., d:])
+
+
+@jax.jit
+def _dispersed(chain: GibbsChain, drawn: Float[Array, "M n L D"]) -> GibbsChain:
+    means = chain.smoothed.means
+    return _with_pairs(chain, means + DISPERSION * (drawn - means))
+
+
+@jax.jit
+def _mobility(before: GibbsChain, after: GibbsChain) -> Float[Array, "n L"]:
+    variances = jnp.diagonal(after.smoothed.covariances, axis1=-2, axis2=-1)
+    square = jnp.mean((_pairs(after) - _pairs(before)) ** 2, 0) / (2 * variances)
+    return jnp.where(after.reported.live, jnp.min(square, -1), jnp.nan)
+
+
+def _warn_of_frozen(mobility: Float[np.ndarray, "n L"]) -> None:
+    frozen = mobility < FROZEN
+    if frozen.any():
+        i, t = np.unravel_index(np.nanargmin(mobility), mobility.shape)
+        warnings.warn(
+            f"{frozen.sum()} of {np.isfinite(mobility).sum()} steps hardly moved, the least of them "
+            f"trajectory {i}, step {t} ({mobility[i, t]:.1g} of what independent draws would): make more "
+            "sweeps, or smooth with GaussianTruth",
+            stacklevel=3,
+        )
+
+
+def _move_whole(
+    truth: GaussianTruth,
+    policy: Any,
+    sensor: GaussianSensor,
+    filtered: GaussianFiltered,
+    chain: GibbsChain,
+    key: Array,
+) -> GibbsChain:
+    """Move whole trajectories by steps of several strides, those that suit narrow and wide posteriors."""
+    log_ratio = _log_exact_to_smoothed(truth, policy, sensor, filtered, chain)
+    for stride, k in zip(STRIDES, jax.random.split(key, len(STRIDES)), strict=True):
+        key_draw, key_accept = jax.random.split(k)
+        candidate = _stridden(chain, _draw(key_draw, filtered, truth.draws), stride)
+        log_candidate = _log_exact_to_smoothed(truth, policy, sensor, filtered, candidate)
+        chain, log_ratio = _chosen(key_accept, chain, candidate, log_ratio, log_candidate)
+    return chain
+
+
+@jax.jit
+def _stridden(chain: GibbsChain, drawn: Float[Array, "M n L D"], stride: float) -> GibbsChain:
+    means = chain.smoothed.means
+    here, there = _pairs(chain) - means, drawn - means
+    return _with_pairs(chain, means + jnp.sqrt(1 - stride**2) * here + stride * there)
+
+
+@jax.jit
+def _chosen(
+    key: Array, chain: GibbsChain, candidate: GibbsChain, log_ratio: Array, log_candidate: Array
+) -> tuple[GibbsChain, Array]:
+    accept = jnp.log(jax.random.uniform(key, log_ratio.shape)) < log_candidate - log_ratio
+    rows = accept[..., None, None]
+    chain = chain._replace(
+        observations=jnp.where(rows, candidate.observations, chain.observations),
+        actions=jnp.where(rows, candidate.actions, chain.actions),
+        accepted_whole=chain.accepted_whole + jnp.sum(accept, 0),
+    )
+    return chain, jnp.where(accept, log_candidate, log_ratio)
+
+
+def _log_exact_to_smoothed(
+    truth: GaussianTruth, policy: Any, sensor: GaussianSensor, filtered: GaussianFiltered, chain: GibbsChain
+) -> Float[Array, "M n"]:
+    """Log-density of each chain's truth and the reports, less that of the truth under the smoother."""
+    s, a = chain.observations, chain.actions
+    flat = _next(truth.dynamics, s.reshape(-1, s.shape[-1]), a.reshape(-1, a.shape[-1]))
+    exact = log_joint(truth.model, policy, sensor, chain.reported, s, a, flat.reshape(s.shape))
+    return exact - _log_density(filtered, chain.reported, _pairs(chain))
 
 
 def _sweep(
@@ -289,11 +448,11 @@ def _update(
     accept = live & (jnp.log(jax.random.uniform(key_accept, log_ratio.shape)) < log_ratio)
     new = jnp.where(accept[:, None], candidate, value).reshape(moving[:, :, steps].shape)
     moved = moving.at[:, :, steps].set(new)
+    by_step = jnp.sum(accept.reshape(new.shape[:3]), 0)
     return chain._replace(
         observations=moved if which == "states" else s,
         actions=a if which == "states" else moved,
-        accepted=chain.accepted + jnp.sum(accept),
-        proposed=chain.proposed + jnp.sum(live),
+        accepted=chain.accepted.at[int(which == "actions"), :, steps].add(by_step.T),
     )
 
 

@@ -27,6 +27,7 @@ from jax.scipy.linalg import solve_triangular
 from jax.scipy.stats import norm
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from ..models.arguments import as_key, described
 from ..models.sensing import (
     GaussianSensor,
     Recording,
@@ -41,6 +42,7 @@ from .kalman import (
     GaussianFiltered,
     GaussianSmoothed,
     filter_gaussian,
+    log_density_filtered,
     sample_filtered,
     smooth_filtered,
 )
@@ -245,6 +247,19 @@ def _draw(key: Array, filtered: GaussianFiltered, draws: int) -> Float[Array, "M
 
 
 @jax.jit
+def _log_density(
+    filtered: GaussianFiltered, reported: Recording, pairs: Float[Array, "M n L D"]
+) -> Float[Array, "M n"]:
+    """Log-density of truths under the linearised posterior."""
+
+    def one(inputs: tuple) -> Float[Array, " M"]:
+        passed, live, drawn = inputs
+        return jax.vmap(lambda x: log_density_filtered(passed, x, live))(drawn)
+
+    return lax.map(one, (filtered, reported.live, pairs.swapaxes(0, 1))).T
+
+
+@jax.jit
 def _axes(bounds: Bounds, sensor: GaussianSensor, chain: TruthChain) -> tuple[Array, Array, Array]:
     """Centre, Cholesky factor, and the points of the differences ``[n, L, 1 + 2 D, D]``."""
     reports = jnp.concatenate([chain.reported.observations, chain.reported.actions], -1)
@@ -310,8 +325,10 @@ class GaussianTruth(NamedTuple):
     def init(self, reported: Recording, sensor: GaussianSensor) -> TruthChain:
         """Start at the reports, as uncertain as the sensor is; nothing is linearised yet.
 
-        Raises ``ValueError`` where the sizes are not the model's.
+        Raises ``ValueError`` where the sizes are not the model's, and ``TypeError`` for another sensor.
         """
+        if not isinstance(sensor, GaussianSensor):
+            raise TypeError(f"sensor must be a GaussianSensor; got {described(sensor)}")
         d = self.model.initial_mean.shape[0]
         if reported.actions.ndim != 3 or reported.observations.shape[-1] != d:
             raise ValueError(
@@ -345,6 +362,13 @@ class GaussianTruth(NamedTuple):
 
         Raises ``ValueError`` for fewer than one pass (:meth:`resample` draws without).
         """
+        chain, filtered = self.smooth(chain, policy, sensor, passes)
+        return chain, _bounded_truths(self.bounds, chain.reported, _draw(as_key(key), filtered, self.draws))
+
+    def smooth(
+        self, chain: TruthChain, policy: Any, sensor: GaussianSensor, passes: int = 1
+    ) -> tuple[TruthChain, GaussianFiltered]:
+        """Relinearise and smooth so many times; :meth:`refresh` draws from what this returns."""
         if passes < 1:
             raise ValueError(f"passes must be at least 1, got {passes}")
         sensor = self._sized(sensor, chain)
@@ -354,12 +378,12 @@ class GaussianTruth(NamedTuple):
             filtered = _filter(self.model, self.bounds, policy, sensor, chain)
             smoothed = _smooth(filtered)
             chain = chain._replace(means=smoothed.means, covariances=smoothed.covariances)
-        return chain, _bounded_truths(self.bounds, chain.reported, _draw(key, filtered, self.draws))
+        return chain, filtered
 
     def resample(self, chain: TruthChain, policy: Any, key: Array, sensor: GaussianSensor) -> Truths:
         """Draws with the dynamics as last linearised; one :meth:`refresh` must have gone before."""
         filtered = _filter(self.model, self.bounds, policy, self._sized(sensor, chain), chain)
-        return _bounded_truths(self.bounds, chain.reported, _draw(key, filtered, self.draws))
+        return _bounded_truths(self.bounds, chain.reported, _draw(as_key(key), filtered, self.draws))
 
     def posterior(self, chain: TruthChain, policy: Any, sensor: GaussianSensor) -> GaussianSmoothed:
         """Moments of the pairs ``(s, a)``, with the dynamics as last linearised, and the log-likelihood."""

@@ -183,6 +183,30 @@ def sample_filtered(key: Array, filtered: GaussianFiltered, draws: int) -> Float
     return jnp.concatenate([drawn, last[None]]).swapaxes(0, 1)
 
 
+def log_density_filtered(
+    filtered: GaussianFiltered, states: Float[Array, "L D"], read: Bool[Array, " L"]
+) -> Float[Array, ""]:
+    """Log-density of a chain given all readings, in nats, as :func:`sample_filtered` draws it.
+
+    Only steps with a reading count: nothing must lead from them to the others, as on padding.
+    """
+
+    def step(following: Array, inputs: tuple) -> tuple:
+        mean, predicted, gain, conditional, state = inputs
+        return state, _log_normal(state - mean - gain @ (following - predicted), conditional)
+
+    inputs = (filtered.means[:-1], filtered.predicted, filtered.gains, filtered.conditional, states[:-1])
+    each: Array = lax.scan(step, states[-1], inputs, reverse=True)[1]
+    last = _log_normal(states[-1] - filtered.means[-1], filtered.covariances[-1])
+    return jnp.sum(jnp.where(read, jnp.concatenate([each, last[None]]), 0.0))
+
+
+def _log_normal(difference: Float[Array, " D"], covariance: Float[Array, "D D"]) -> Float[Array, ""]:
+    root = _root(covariance)
+    z = jax.scipy.linalg.solve_triangular(root, difference, lower=True)
+    return -0.5 * (z @ z + len(z) * jnp.log(2 * jnp.pi)) - jnp.sum(jnp.log(jnp.diagonal(root)))
+
+
 def _root(covariance: Float[Array, "D D"]) -> Float[Array, "D D"]:
     """A Cholesky factor, of a covariance that rounding may have left a hair short of positive definite."""
     slack = 1e-14 * jnp.trace(covariance) * jnp.eye(covariance.shape[0])

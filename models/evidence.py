@@ -99,7 +99,8 @@ def as_sensor(given: Any) -> Imperfection:
     """
     if _is_sensor(given):
         return given
-    if isinstance(given, list | tuple) or hasattr(given, "__array__"):
+    plain = isinstance(given, list | tuple) and not hasattr(given, "_fields")
+    if plain or hasattr(given, "__array__"):
         mask = concrete("sensor", given, None)
         if mask is None or (mask.ndim == 1 and mask.dtype.kind in "bf"):
             return Visibility(given)

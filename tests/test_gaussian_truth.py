@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import warnings
 from typing import NamedTuple
 
 import jax
@@ -9,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from i2rl.analysis.benchmarks.gibbs import PENDULUM, particle_smoother
 from i2rl.inference.gaussian_gibbs import GaussianGibbs
 from i2rl.inference.gaussian_truth import (
     Bounds,
@@ -52,13 +55,7 @@ def affine(s, a):
     return jnp.asarray(A) @ s + jnp.asarray(B) @ a + jnp.asarray(C)
 
 
-def pendulum(s, a):
-    """A damped pendulum with a torque, in steps of 0.2 seconds."""
-    turning = 0.95 * s[1] - 1.2 * jnp.sin(s[0]) + 0.6 * jnp.tanh(a[0])
-    return jnp.stack([s[0] + 0.2 * turning, turning])
-
-
-AFFINE, PENDULUM = jax_dynamics(affine), jax_dynamics(pendulum)
+AFFINE = jax_dynamics(affine)
 
 
 def simulated(f, lengths, policy, noise, seed=0):
@@ -158,13 +155,14 @@ def test_draws_have_the_posterior_and_their_own_successors():
 def test_gibbs_accepts_everything_and_agrees_with_the_closed_form_on_affine_problems():
     reported = affine_problem()
     gibbs = GaussianGibbs(affine_truth(draws=250), sweeps=1)
-    chain = gibbs.init(reported)
+    chain = gibbs.init(reported, SENSOR)
     kept = []
-    for i in range(160):
+    for i in range(40):
         chain, _ = gibbs.refresh(chain, POLICY, jax.random.fold_in(KEY, i), SENSOR)
-        if i >= 40:
+        if i >= 5:
             kept.append(np.asarray(jnp.concatenate([chain.observations, chain.actions], -1)))
-    assert chain.accepted == chain.proposed > 0
+    assert chain.least_acceptance == 1
+    np.testing.assert_allclose(chain.acceptance_whole, 1)
     x = np.stack(kept)  # [sweeps, chains, n, L, D]
     for i, length in enumerate(reported.lengths):
         mean, covariance, _ = least_squares(reported, i)
@@ -178,9 +176,9 @@ def test_gibbs_accepts_everything_and_agrees_with_the_closed_form_on_affine_prob
         assert (abs(squares.mean(0) - np.einsum("titi->ti", covariance)) < 5 * error).all()
 
 
-def pendulum_problem(lengths, sensor, seed=0):
+def pendulum_problem(lengths, sensor, seed=0, process=1e-2):
     policy = AffinePolicy(jnp.array([[-0.3, 0.5]]), jnp.array([0.2]), jnp.array([[0.3]]))
-    truth = simulated(PENDULUM, lengths, policy, 1e-2 * np.eye(d), seed)
+    truth = simulated(PENDULUM, lengths, policy, process * np.eye(d), seed)
     return policy, truth, distort(jax.random.fold_in(KEY, seed), sensor, truth)
 
 
@@ -192,12 +190,12 @@ def test_smoother_gibbs_and_importance_sampling_agree_on_a_pendulum():
     chain, drawn = truth.refresh(truth.init(reported, sensor), policy, KEY, sensor, passes=5)
     posterior = truth.posterior(chain, policy, sensor)
     gibbs = GaussianGibbs(truth._replace(draws=250), sweeps=1)
-    walk, total = gibbs.init(reported), 0
-    for i in range(180):
+    walk, total = gibbs.init(reported, sensor), 0
+    for i in range(50):
         walk, _ = gibbs.refresh(walk, policy, jax.random.fold_in(KEY, i), sensor)
-        if i >= 60:
-            total += np.asarray(jnp.concatenate([walk.observations, walk.actions], -1)) / 120
-    assert 0.8 < walk.accepted / walk.proposed < 1
+        if i >= 10:
+            total += np.asarray(jnp.concatenate([walk.observations, walk.actions], -1)) / 40
+    assert 0.8 < walk.least_acceptance < 1
 
     following = PENDULUM.next_state(drawn.observations.reshape(-1, d), drawn.actions.reshape(-1, k))
     log_p = log_joint(
@@ -362,3 +360,44 @@ def test_what_is_wrong_with_a_model_is_said(options, message):
 def test_recordings_of_another_size_are_refused():
     with pytest.raises(ValueError, match=r"expected observations \[n, L, 3\]"):
         gaussian_truth(AFFINE, 3).init(affine_problem(), SENSOR)
+
+
+def test_gibbs_leaves_the_reports_where_they_are_noisy_and_single_steps_hardly_move():
+    sensor, process = GaussianSensor(0.4, 0.4), 0.003
+    policy, _, reported = pendulum_problem((6, 4), sensor, seed=2, process=process)
+    truth = gaussian_truth(PENDULUM, d, process_covariance=process, initial_covariance=1.0, draws=250)
+    gibbs = GaussianGibbs(truth, sweeps=1)
+    chain, kept = gibbs.init(reported, sensor), []
+    for i in range(30):
+        chain, _ = gibbs.refresh(chain, policy, jax.random.fold_in(KEY, i), sensor)
+        if i >= 10:
+            kept.append(np.asarray(jnp.concatenate([chain.observations, chain.actions], -1))[:, 0])
+    first = jax.tree.map(lambda x: x[:1], reported)
+    draws = particle_smoother(KEY, policy, process, 0.4, first, particles=4000, draws=800)
+    expected, deviations = np.asarray(draws.mean(0)), np.asarray(draws.std(0))
+    reports = np.concatenate([reported.observations[0], reported.actions[0]], -1)
+    assert (abs(reports - expected) / deviations).max() > 4
+    found = np.concatenate(kept)
+    assert (abs(found.mean(0) - expected) / deviations).max() < 0.3
+    assert 0.85 < (found.std(0) / deviations).mean() < 1.15
+    assert 0.3 < chain.least_acceptance < 1
+    assert (chain.acceptance_whole > 0.1).all()
+    live = np.asarray(reported.live)
+    assert np.asarray(chain.mobility)[live].min() > 0.05
+    assert np.isnan(np.asarray(chain.mobility)[~live]).all()
+
+
+def test_steps_that_hardly_move_are_a_warning():
+    # Dynamics so exact that what an affine function leaves over of them rules every joint move out.
+    sensor, process = GaussianSensor(0.4, 0.4), 1e-8
+    policy, _, reported = pendulum_problem((6, 4), sensor, seed=2, process=process)
+    truth = gaussian_truth(PENDULUM, d, process_covariance=process, initial_covariance=1.0, draws=250)
+    gibbs = GaussianGibbs(truth, sweeps=1)
+    chain = gibbs.init(reported, sensor)
+    for i in range(6):
+        with warnings.catch_warnings(record=True) as caught:
+            warnings.simplefilter("always")
+            chain, _ = gibbs.refresh(chain, policy, jax.random.fold_in(KEY, i), sensor)
+        assert bool(caught) == (np.nanmin(chain.mobility) < 0.01)
+    assert re.search(r"of 10 steps hardly moved, .* trajectory \d, step \d", str(caught[0].message))
+    assert chain.least_acceptance > 0.5
