@@ -248,9 +248,9 @@ def describe_identifiability(result: Identifiability) -> str:
     )
     lines = [head, *(f"- {line}" for line in lines)]
     if result.weak:
-        number = len(result.weak)
+        weak = len(result.weak)
         lines.append(
-            f"{number} more {'is' if number == 1 else 'are'} weakly determined: the standard error exceeds "
+            f"{weak} more {'is' if weak == 1 else 'are'} weakly determined: the standard error exceeds "
             f"{result.scale:g}:"
         )
         lines += [

@@ -24,6 +24,7 @@ from .sorting_table import (
     behaviours,
     caption,
     cells,
+    print_sorting_table,
     sorting_table_plot,
     sorting_table_summary,
 )
@@ -185,7 +186,7 @@ def _sorting_tables(study: SortingStudy) -> list[Table]:
 def print_tables(study: SortingStudy, console: Console) -> None:
     """Print the results and Table 7.2."""
     print_page_tables([_results_table(study)], console, f"{_title(study)}. {_scope(study)}")
-    print_page_tables(_sorting_tables(study), console)
+    print_sorting_table(study.table, console)
 
 
 def _lead(study: SortingStudy) -> Lead:
