@@ -83,7 +83,7 @@ def _estimates(study: SortingStudy) -> dict[str, Estimates]:
     demonstration = study.demonstration
     behaviour_of = {way: b for b, way in match_ways(study.labels, result.found.assignments).items()}
     seen = demonstration.kind == SEEN
-    found = {}
+    found: dict[str, Estimates] = {}
     for way in np.unique(result.found.assignments).tolist():
         weights = np.asarray(result.found.weights[way])
         errors = np.full(len(weights), np.inf)
