@@ -98,13 +98,8 @@ def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
     handles = max((p.get_legend_handles_labels()[0] for p in panels), key=len)
     head(figure, theme, handles, title=results.title, columns=2)
     over = f"; LBA over {results.accuracy_over}" if "accuracy" in shown else ""
-    seeds = counted(results.seeds, "seed")
-    band = (
-        "line: one seed"
-        if results.seeds == 1
-        else f"line: mean of {seeds}; band: its 95% interval (Student's)"
-    )
-    foot(figure, theme, f"{band}{over}")
+    mean = f"line: mean of {counted(results.seeds, 'seed')}; band: its 95% interval (Student's)"
+    foot(figure, theme, ("line: one seed" if results.seeds == 1 else mean) + over)
     return figure
 
 
@@ -126,6 +121,7 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
             axes.annotate(
                 f"not known: noise cost something in {found.lost:.0%} of resamples", (0.03, y), va="center",
                 xycoords=axes.get_yaxis_transform(), color=style["color"], fontsize=SMALL,
+                bbox={"boxstyle": "square,pad=0.2", "facecolor": theme.surface, "edgecolor": "none"},
             )  # fmt: skip
             continue
         ends = np.clip([found.low, found.high], low, high)

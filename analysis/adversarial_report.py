@@ -394,10 +394,10 @@ def _lead(all_results: Sequence[AdversarialResults]) -> Lead:
             m: x.mean() for m in (CLEAN, NOISY, ROBUST) if (x := results.late(m, results.measure)) is not None
         }
         shown = [
-            f"{m} {100 * x:.0f} %" if results.measure == "accuracy" else f"{m} {x:,.{_digits(x)}f}"
+            f"{100 * x:.0f} % ({m})" if results.measure == "accuracy" else f"{x:,.{_digits(x)}f} ({m})"
             for m, x in late.items()
         ]
-        learned.append(f"in {name} {listed(shown)} ({measure})")
+        learned.append(f"in {name} a{'n' * (measure == 'LBA')} {measure} of {listed(shown)}")
         found = results.recovery()
         if found is not None:
             known = found.lost == 1 and math.isfinite(found.share)

@@ -52,7 +52,11 @@ class Estimates(NamedTuple):
             zip(self.names, self.weights, self.intervals, strict=True)
         ):
             known = np.isfinite([low, high]).all()
-            row: list[str | float] = [name, float(weight), _ends(low, high) if known else "not determined"]
+            row: list[str | float] = [
+                name,
+                round(float(weight), 12),
+                _ends(low, high) if known else "not determined",
+            ]
             if truth is not None:
                 row += [f"{share[k]:+.2f}" for share in (_shares(self.weights), _shares(truth))]
             rows.append(row)

@@ -24,7 +24,7 @@ from .label_bias import (
 from .page import Lead, Section, Table, drawn, write_page
 from .page import print_tables as print_page_tables
 from .results import plain, study_provenance
-from .text import counted, number
+from .text import NOTHING, counted, number
 
 if TYPE_CHECKING:
     from rich.console import Console
@@ -82,6 +82,8 @@ def _summary(study: LabelBiasStudy) -> dict[str, Any]:
 
 def _tables(study: LabelBiasStudy) -> tuple[Table, ...]:
     def told(c: Correlation) -> tuple[str, ...]:
+        if np.isnan(c.rho):
+            return "none", NOTHING, NOTHING, f"{c.n}"
         return f"{c.rho:.4f}", f"{c.low:.2f} to {c.high:.2f}", tell_p(c.p), f"{c.n}"
 
     table = Table(
@@ -101,8 +103,8 @@ def _tables(study: LabelBiasStudy) -> tuple[Table, ...]:
         (
             row["setting"],
             *_told_of_birl(result),
-            f"{100 * result.negative.value:.0f} %",
-            f"{row['median rho of choices met']:+.2f}",
+            _share(result.negative.value),
+            _signed(row["median rho of choices met"]),
             number(row["MaxEnt largest |1 - rho|"], 1),
         )
         for row, result in zip(_rows(study), study.results, strict=True)
@@ -136,13 +138,21 @@ def _tables(study: LabelBiasStudy) -> tuple[Table, ...]:
     )
 
 
+def _signed(rho: float) -> str:
+    return NOTHING if np.isnan(rho) else f"{rho:+.2f}"
+
+
 def _told_of_birl(result: SettingResult) -> tuple[str, str]:
     low, median, high = quantiles(result.birl)
     share, least, most = result.significant
     return (
-        f"{median:+.2f} ({low:+.2f} to {high:+.2f})",
-        f"{100 * share:.0f} % ({100 * least:.0f} to {100 * most:.0f})",
+        "none" if np.isnan(median) else f"{median:+.2f} ({low:+.2f} to {high:+.2f})",
+        NOTHING if np.isnan(share) else f"{_share(share)} ({100 * least:.0f} to {100 * most:.0f})",
     )
+
+
+def _share(share: float) -> str:
+    return NOTHING if np.isnan(share) else f"{100 * share:.0f} %"
 
 
 def _text(study: LabelBiasStudy) -> str:
@@ -158,7 +168,7 @@ opposite directions, and what comes out depends on how sharply experts choose.
 
 With exp(Q) as the dissertation writes it (eta 1), a discount of {DISCOUNT:g}, {first.setting.steps} steps \
 and experts that follow that law, the correlation is significant at 0.05 in \
-{100 * first.significant.value:.0f} % of the worlds; chance alone would give 5 %.
+{_share(first.significant.value)} of the worlds; chance alone would give 5 %.
 
 {_conditions(study)}
 
@@ -213,10 +223,15 @@ def _lead(study: LabelBiasStudy) -> Lead:
         )
     )
     share, least, most = first.significant
+    often = (
+        ""
+        if np.isnan(share)
+        else f"BIRL's correlation is significant in {_share(share)} of these worlds ({100 * least:.0f} to "
+        f"{100 * most:.0f}; by chance 5), and "
+    )
     trust = (
-        "Trust the first as a theorem, and the second for its setting only: BIRL's correlation is "
-        f"significant in {100 * share:.0f} % of these worlds ({100 * least:.0f} to {100 * most:.0f}; by "
-        "chance 5), and other settings below give it any value."
+        f"Trust the first as a theorem, and the second for its setting only: {often}other settings below "
+        "give it any value."
     )
     return Lead(learned, trust, _tables(study)[:1])
 

@@ -420,7 +420,7 @@ def tables(result: LabyrinthStudy) -> list[Table]:
     for view in result.views:
         outside = view.decisions_out_of_view.sum()
         first = view.predictions[0]
-        rows = []
+        rows: list[tuple[str | float, ...]] = []
         for p in sorted(view.predictions, key=lambda p: -p.bits.sum()):
             score = bits_per_decision(p.bits, result.decisions)
             delta = bits_per_decision(p.bits - first.bits, result.decisions)

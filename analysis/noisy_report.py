@@ -352,7 +352,7 @@ def _lead(study: NoisyStudy) -> Lead:
     trust = f"{verdict} ({chance}; {runs}), {sensor}."
     rows = [
         (
-            row["feature"], row["learned"], row["posterior median"],
+            row["feature"], round(row["learned"], 12), row["posterior median"],
             f"{number(row['95 % interval'][0])} to {number(row['95 % interval'][1])}", float(true),
         )
         for row, true in zip(_reward(study) or [], study.task.weights, strict=False)

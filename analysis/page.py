@@ -79,7 +79,7 @@ class Table(NamedTuple):
     """
 
     headings: Sequence[str]
-    rows: Sequence[Sequence[str | Real]]
+    rows: Sequence[Sequence[str | float | Real]]
     caption: str = ""
 
 
@@ -235,7 +235,7 @@ def _section(section: Section, prose: _Prose) -> str:
     return "<section>\n" + "\n".join(parts) + "\n</section>"
 
 
-def _cell(cell: str | Real) -> str:
+def _cell(cell: str | float | Real) -> str:
     return number(cell) if isinstance(cell, Real) else str(cell)
 
 

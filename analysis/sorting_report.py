@@ -24,6 +24,7 @@ from .sorting_table import (
     behaviours,
     caption,
     cells,
+    print_sorting_table,
     sorting_table_plot,
     sorting_table_summary,
 )
@@ -82,7 +83,7 @@ def _estimates(study: SortingStudy) -> dict[str, Estimates]:
     demonstration = study.demonstration
     behaviour_of = {way: b for b, way in match_ways(study.labels, result.found.assignments).items()}
     seen = demonstration.kind == SEEN
-    found = {}
+    found: dict[str, Estimates] = {}
     for way in np.unique(result.found.assignments).tolist():
         weights = np.asarray(result.found.weights[way])
         errors = np.full(len(weights), np.inf)
@@ -185,7 +186,7 @@ def _sorting_tables(study: SortingStudy) -> list[Table]:
 def print_tables(study: SortingStudy, console: Console) -> None:
     """Print the results and Table 7.2."""
     print_page_tables([_results_table(study)], console, f"{_title(study)}. {_scope(study)}")
-    print_page_tables(_sorting_tables(study), console)
+    print_sorting_table(study.table, console)
 
 
 def _lead(study: SortingStudy) -> Lead:

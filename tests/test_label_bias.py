@@ -210,7 +210,7 @@ def test_the_report_says_where_the_correlation_is_significant():
 
 
 @pytest.mark.parametrize(
-    ("p", "told"), [(0.39321, "0.3932"), (3e-5, "< 1e-4"), (1e-9, "< 1e-9"), (0.0, "< 1e-300")]
+    ("p", "told"), [(0.39321, "0.3932"), (3e-5, "< 0.0001"), (1e-9, "< 1 × 10⁻⁹"), (0.0, "< 1 × 10⁻³⁰⁰")]
 )
 def test_small_p_values_are_told_by_their_power_of_ten(p, told):
     assert label_bias.tell_p(p) == told
