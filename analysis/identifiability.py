@@ -114,7 +114,8 @@ def identifiability_of(
         (the likelihood itself need not have a maximum).
     scale : float
         How large scaled weights (:mod:`~i2rl.models.units`) are reasonably thought to be; the default is the
-        prior's standard deviation, so that a weakly determined direction is one of which the demonstration says less than the prior.
+        prior's standard deviation, so that a weakly determined direction is one of which the
+        demonstration says less than the prior.
 
     Raises
     ------
