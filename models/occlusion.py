@@ -72,7 +72,7 @@ class _Scaled(constraints.Constraint[Any]):
 @dist.biject_to.register(_Scaled)
 def _to_scaled(constraint: _Scaled) -> Transform:
     # Samplers so move in scaled weights, whatever the units.
-    unscale = AffineTransform(0.0, 1 / constraint.scale, domain=constraints.real_vector)
+    unscale = AffineTransform(0.0, 1 / constraint.scale)
     return ComposeTransform([dist.biject_to(constraint.base), unscale])
 
 

@@ -63,6 +63,9 @@ def with_scaled_features(mdp: TabularMDP) -> TabularMDP:
     feature_scale : the scales.
     """
     scale = feature_scale(mdp)
-    if isinstance(scale, np.ndarray) and (scale == 1).all():
+    if not isinstance(scale, np.ndarray):
+        return replace(mdp, features=mdp.features / scale)
+    if (scale == 1).all():
         return mdp
-    return replace(mdp, features=jnp.asarray(mdp.features) / scale)
+    # XLA multiplies by reciprocals, which leaves the largest magnitude a little off 1.
+    return replace(mdp, features=jnp.asarray(np.asarray(mdp.features) / scale))

@@ -353,6 +353,22 @@ def test_more_of_a_soft_expert_determines_more(random_mdp):
     )
 
 
+def test_what_is_not_determined_is_the_same_in_all_units(random_mdp):
+    mdp, units = small(random_mdp(8)), np.array([1e-9, 1e6])
+    other = with_features(mdp, np.asarray(mdp.features) * units)
+    shown = sample_demonstration(jax.random.key(0), TrajectoryLaw(mdp, THETA, HALF, LENGTH), 2)
+    plain, found = (
+        identifiability_of(process, HALF, shown.padded(ROWS, LENGTH), weights)
+        for process, weights in ((mdp, THETA), (other, THETA / units))
+    )
+    assert plain.weak
+    np.testing.assert_allclose(found.standard_errors * units, plain.standard_errors, rtol=1e-6)
+    np.testing.assert_allclose(found.length_loss, plain.length_loss, atol=1e-8)
+    for a, b in zip(found.weak, plain.weak, strict=True):
+        np.testing.assert_allclose(a.vector, b.vector, atol=1e-6)
+        assert a.description == b.description
+
+
 def test_nothing_seen_determines_nothing(random_mdp):
     mdp = small(random_mdp(8))
     demo = Demonstration.from_steps([["hidden"] * LENGTH] * 4, mdp).padded(ROWS, LENGTH)

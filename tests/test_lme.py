@@ -50,7 +50,7 @@ def demonstration(mdp, sensor):
 
 @pytest.fixture(scope="module")
 def objective(mdp):
-    """Penalised exact log-likelihood per trajectory, written without the learner; slack is of scaled weights."""
+    """Penalised exact log-likelihood per trajectory, written without the learner."""
     scale = feature_scale(mdp)
 
     @jax.jit

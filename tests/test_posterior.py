@@ -1,5 +1,7 @@
 """The posterior over weights and hidden steps."""
 
+from dataclasses import replace
+
 import arviz as az
 import jax
 import jax.numpy as jnp
@@ -93,6 +95,21 @@ def test_posterior_agrees_with_quadrature(idata, mdp, sensor, demonstration):
     assert_moments(idata, *grid_moments(mdp, sensor, demonstration, None, -12.0, 12.0))
     assert not idata.sample_stats.diverging.any()
     assert float(az.rhat(idata).weights.max()) < 1.03
+
+
+def test_draws_are_the_same_but_for_units(idata, mdp, sensor, demonstration):
+    units = np.array([2.0**30, 2.0**-20])
+    other = replace(mdp, features=mdp.features * units)
+    drawn = (
+        sample_posterior(
+            jax.random.key(0), other, sensor, demonstration, completions=False, **OPTIONS
+        ).posterior.weights
+        * units
+    )
+    plain = idata.posterior.weights
+    # Rounding of the priors' scales sets chains apart, and nothing else does.
+    error = np.hypot(az.mcse(plain).weights.values, az.mcse(drawn).weights.values)
+    np.testing.assert_array_less(np.abs((plain - drawn).mean(("chain", "draw")).values), 4.5 * error)
 
 
 def test_posterior_under_a_prior_on_positive_weights_agrees_with_quadrature(mdp, sensor, demonstration):
