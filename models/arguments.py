@@ -92,13 +92,6 @@ def rebuilt_unchecked(cls: Fields) -> Fields:
     return cls
 
 
-def rounding(given: Any, terms: int) -> float:
-    """Most by which a sum of probabilities of the given precision may differ from one."""
-    dtype = np.asarray(given).dtype
-    eps = float(jnp.finfo(dtype).eps) if jnp.issubdtype(dtype, jnp.floating) else 0.0
-    return max(1e-8, 8 * terms**0.5 * eps)
-
-
 def described(given: Any) -> str:
     """Describe an argument in a message: type, shape and the beginning of what it prints."""
     shape = getattr(given, "shape", None)

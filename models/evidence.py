@@ -17,9 +17,10 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from .arguments import as_key, concrete, described, is_traced, rebuilt_unchecked, rounding
+from .arguments import as_key, concrete, described, is_traced, rebuilt_unchecked
 from .demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
 from .mdp import TabularMDP, _PairNames
+from .probabilities import normalised, sum_tolerance
 
 
 class Imperfection(Protocol):
@@ -174,7 +175,7 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
         if np.isnan(table).any():
             raise ValueError(f"log_probabilities must be numbers; that of {_first(np.isnan(table))} is nan")
         with np.errstate(over="ignore"):
-            total = _row_sums(np.exp(table), rounding(log_probabilities, _row_size(table)))
+            total = _row_sums(np.exp(table), log_probabilities)
         inexact = np.abs(total - 1) > _KEPT
         return super().__new__(cls, jnp.asarray(np.where(inexact, table - np.log(total), table)))
 
@@ -186,9 +187,9 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
             return ObservationModel._make((_log(jnp.asarray(probabilities, float)),))
         if not np.isfinite(o).all() or (o < 0).any():
             raise ValueError("observation probabilities must be non-negative numbers")
-        total = _row_sums(o, rounding(probabilities, _row_size(o)))
+        _row_sums(o, probabilities)
         with np.errstate(divide="ignore"):
-            log_o = np.log(np.where(np.abs(total - 1) > _KEPT, o / total, o))
+            log_o = np.log(normalised(o, (2, 3)))
         return ObservationModel._make((jnp.asarray(log_o),))
 
     @staticmethod
@@ -240,14 +241,12 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
 _KEPT = 1e-12
 
 
-def _row_size(table: np.ndarray) -> int:
-    return int(np.prod(table.shape[2:]))
-
-
-def _row_sums(o: np.ndarray, tolerance: float) -> Float[np.ndarray, "S A 1 1"]:
+def _row_sums(o: np.ndarray, given: Any) -> Float[np.ndarray, "S A 1 1"]:
+    """Sum ``o [S, A, S, A]``, made of what was given; ``ValueError`` unless each truth's row sums to one."""
     if o.ndim != 4 or o.shape[:2] != o.shape[2:]:
         raise ValueError(f"an observation model has shape [S, A, S, A], truth first, got {o.shape}")
     total = o.sum((2, 3), keepdims=True)
+    tolerance = sum_tolerance(np.asarray(given).dtype, o.shape[2] * o.shape[3])
     if not np.abs(total - 1).max(initial=0) <= tolerance:
         s, a, *_ = np.unravel_index(np.abs(total - 1).argmax(), total.shape)
         raise ValueError(f"observation probabilities of pair ({s}, {a}) sum to {total[s, a, 0, 0]}, not 1")
