@@ -17,6 +17,7 @@ from numpyro.infer.util import log_density
 from i2rl.inference.smoothing import evidence_of, log_likelihoods
 from i2rl.models import (
     Demonstration,
+    DemonstrationError,
     ObservationModel,
     Sensor,
     TrajectoryLaw,
@@ -189,7 +190,7 @@ def test_values_and_arguments_are_validated(random_mdp):
     with pytest.raises(ValueError, match="weights"):
         TrajectoryLaw(mdp, jnp.array([1.0, jnp.nan]), Sensor(), 2, validate_args=True)
     law = TrajectoryLaw(mdp, WEIGHTS, Sensor(), 1, validate_args=True)
-    with pytest.warns(UserWarning, match="Out-of-support values"):
+    with pytest.raises(DemonstrationError, match="trajectory 0, step 0: state 9 is out of range"):
         law.log_prob(jnp.array([[SEEN, 9, 0]]))
     with pytest.raises(ValueError, match=r"a value has shape \[\.\.\., 1, 3\], got \(2, 3\)"):
         law.log_prob(jnp.zeros((2, 3), int))
