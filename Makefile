@@ -40,7 +40,10 @@ bench: $(READY)
 	$(BIN)/python -m i2rl.analysis.benchmarks.stopping
 	$(BIN)/python -m i2rl.analysis.benchmarks.selection
 	$(BIN)/python -m i2rl.analysis.benchmarks.kills
+	$(BIN)/python -m i2rl.analysis.benchmarks.journals
 	$(BIN)/python -m i2rl.analysis.benchmarks.fuzz
+	$(BIN)/python -m i2rl.analysis.benchmarks.units
+	$(BIN)/python -m i2rl.analysis.benchmarks.gibbs
 	$(BIN)/python -m i2rl.analysis.benchmarks.noisy_cost
 	$(BIN)/python -m i2rl.analysis.benchmarks.adversarial_cost
 	$(BIN)/python -m i2rl.analysis.benchmarks.adversarial_patrol

@@ -237,10 +237,8 @@ class _SoftBellmanProgram:
         if not status and proximal == _PROXIMAL and held > _HELD * (1 + np.abs(features).max()):
             status = "weights that grow without bound"
         iterations = int(statistics["iter_count"])
-        return (
-            DualSolution(weights / self._scale, values, float(objective), iterations, not status, point),
-            status,
-        )
+        weights = weights / self._scale
+        return DualSolution(weights, values, float(objective), iterations, not status, point), status
 
 
 class DualProgram(_SoftBellmanProgram):

@@ -346,7 +346,8 @@ def _fingerprint(tree: object) -> str:
 def _described(prior: dist.Distribution) -> str:
     """A distribution with its parameters, through the wrappers that only shape it."""
     if isinstance(prior, ScaledPrior):
-        return f"{_described(prior.base)} on weights times {np.asarray(prior.scale).tolist()}"
+        scale, base = np.asarray(prior.scale), _described(prior.base)
+        return base if (scale == 1).all() else f"{base} on weights times {scale.tolist()}"
     while hasattr(prior, "base_dist") and type(prior) in (dist.Independent, dist.ExpandedDistribution):
         prior = prior.base_dist
     values = (f"{name}={np.asarray(getattr(prior, name)).tolist()}" for name in prior.arg_constraints)

@@ -50,6 +50,7 @@ from .planning import (
 from .sensing import GaussianSensor, Recording, RecordingError, ShiftSensor, distort, recording
 from .storage import load_mdp, save_mdp
 from .trajectory import TrajectoryLaw, sample_demonstration
+from .units import feature_scale, with_scaled_features
 
 __all__ = [
     "Confusions",
@@ -78,6 +79,7 @@ __all__ = [
     "distort",
     "feature_deviations",
     "feature_expectations",
+    "feature_scale",
     "features_to_go",
     "finite_hard_plan",
     "finite_occupancy",
@@ -101,5 +103,6 @@ __all__ = [
     "stick_proportions",
     "truncation_error",
     "weights_prior",
+    "with_scaled_features",
     "write_trajectories",
 ]

@@ -9,6 +9,7 @@ from i2rl.inference.boltzmann import boltzmann_log_likelihoods, boltzmann_log_po
 from i2rl.inference.policy_walk import birl
 from i2rl.models import Demonstration, DemonstrationError
 from i2rl.models.planning import simulate
+from i2rl.models.units import feature_scale
 
 ETA = 2.0
 TRUE = jnp.array([0.8, -0.3])
@@ -28,12 +29,13 @@ def demonstration(mdp):
 
 @pytest.fixture(scope="module")
 def grid(mdp, demonstration):
-    """Centres of cells ``[G, 2]`` that tile the box, and the log-likelihood of each."""
+    """Centres of cells ``[G, 2]`` that tile the box of scaled weights, and the log-likelihood of each."""
     axis = (np.arange(100) + 0.5) / 50 - 1
     points = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     counts = jnp.asarray(visit_counts(mdp, demonstration))
+    scaled = jnp.asarray(points / feature_scale(mdp))
     total = jax.jit(lambda: jax.lax.map(
-        lambda w: boltzmann_log_likelihoods(mdp, w, counts, ETA).sum(), jnp.asarray(points)))  # fmt: skip
+        lambda w: boltzmann_log_likelihoods(mdp, w, counts, ETA).sum(), scaled))  # fmt: skip
     return points, np.asarray(total())
 
 
@@ -57,7 +59,9 @@ def test_draws_follow_the_posterior(mdp, demonstration, grid, name):
     idata = birl(jax.random.key(1), mdp, demonstration, prior=prior, **OPTIONS)
     mass = np.exp(log_likelihood + log_density(points) - log_likelihood.max())
     expected = np.histogram2d(*points.T, bins=4, range=[[-1, 1]] * 2, weights=mass / mass.sum())[0]
-    np.testing.assert_allclose(cells(idata.posterior["weights"].values), expected, atol=0.02)
+    np.testing.assert_allclose(
+        cells(idata.posterior["weights"].values * feature_scale(mdp)), expected, atol=0.02
+    )
     assert az.rhat(idata)["weights"].max() < 1.02
 
 
@@ -68,7 +72,7 @@ def test_inference_data_is_named_and_consistent(mdp, demonstration):
     assert idata.observed_data["state"].dims == ("trajectory", "step")
     assert list(idata.posterior["feature"].values) == list(mdp.feature_names)
     weights = idata.posterior["weights"].values
-    assert (np.abs(weights) <= 1).all()
+    assert (np.abs(weights * feature_scale(mdp)) <= 1 + 1e-12).all()
     counts = visit_counts(mdp, demonstration)
     each = idata.log_likelihood["demonstration"].values
     for chain, draw in ((0, 0), (1, 4321)):

@@ -24,6 +24,7 @@ from i2rl.models import (
 )
 from i2rl.models.demonstration import UNKNOWN
 from i2rl.models.mdp import Labels
+from i2rl.models.units import with_scaled_features
 
 
 @jax.jit
@@ -33,7 +34,9 @@ def plan_of(mdp, weights):
 
 @pytest.fixture(scope="module")
 def world(random_mdp):
-    return random_mdp(5, n_states=6, n_actions=3, n_successors=2, n_features=3, masked=True)
+    # Steps are of scaled weights: here they are the weights themselves.
+    mdp = random_mdp(5, n_states=6, n_actions=3, n_successors=2, n_features=3, masked=True)
+    return with_scaled_features(mdp)
 
 
 def sampled(mdp, weights, n, length, seed=0):

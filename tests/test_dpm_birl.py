@@ -16,13 +16,15 @@ from i2rl.inference.dpm import best_sample, crp_log_probability, dpm_birl, log_m
 from i2rl.models import Demonstration, DemonstrationError
 from i2rl.models.demonstration import concatenate
 from i2rl.models.planning import simulate
+from i2rl.models.units import with_scaled_features
 
 ETA, ALPHA = 2.0, 0.8
 
 
 @pytest.fixture(scope="module")
 def mdp(random_mdp):
-    return random_mdp(4, n_states=3, n_actions=2, n_features=1)
+    # The box is of scaled weights: here they are the weights themselves.
+    return with_scaled_features(random_mdp(4, n_states=3, n_actions=2, n_features=1))
 
 
 @pytest.fixture(scope="module")

@@ -31,6 +31,7 @@ from i2rl.models.mixture import (
     truncation_error,
 )
 from i2rl.models.occlusion import PRIOR_SCALE, occlusion_model
+from i2rl.models.units import feature_scale
 
 STICKS = jnp.array([0.5, 0.25])
 WEIGHTS = jnp.array([[0.7, -1.3], [-2.0, 0.4], [0.1, 3.0]])
@@ -98,7 +99,7 @@ def test_density_is_a_sum_over_every_assignment_and_every_completion(
     )
     alpha = 1.7
     prior = np.sum(np.log(alpha) + (alpha - 1) * np.log(1 - np.asarray(STICKS)))
-    prior += dist.Normal(0, PRIOR_SCALE).log_prob(WEIGHTS).sum()
+    prior += dist.Normal(0, PRIOR_SCALE / feature_scale(mdp)).log_prob(WEIGHTS).sum()
     expected = float(prior + np.log(total))
     assert density(mdp, sensor, demonstration.codes, concentration=alpha) == pytest.approx(
         expected, rel=1e-10

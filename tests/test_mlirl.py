@@ -8,6 +8,7 @@ from i2rl.inference.maximum_likelihood import ascend, em_mlirl, mlirl
 from i2rl.models import Demonstration, DemonstrationError
 from i2rl.models.demonstration import concatenate
 from i2rl.models.planning import simulate
+from i2rl.models.units import with_scaled_features
 
 ETA = 3.0
 TRUE = np.array([[0.9, -0.6], [-0.8, 0.5]])
@@ -15,7 +16,8 @@ TRUE = np.array([[0.9, -0.6], [-0.8, 0.5]])
 
 @pytest.fixture(scope="module")
 def mdp(random_mdp):
-    return random_mdp(2, n_states=6, n_actions=3, n_features=2)
+    # The box is of scaled weights: here they are the weights themselves.
+    return with_scaled_features(random_mdp(2, n_states=6, n_actions=3, n_features=2))
 
 
 @pytest.fixture(scope="module")

@@ -12,6 +12,7 @@ from scipy import stats
 from i2rl.models import FeatureNoise, TrajectoryLaw, Visibility, reward_of, soft_plan
 from i2rl.models.demonstration import HIDDEN, SEEN, UNKNOWN
 from i2rl.models.noisy_behaviour import noisy_behaviour_model
+from i2rl.models.units import feature_scale
 
 VIEW = np.array([1.0, 0.4, 0.8])
 
@@ -64,7 +65,8 @@ def test_the_density_is_that_of_enumeration(
     log_policy = soft_plan(toy, reward_of(toy, jnp.asarray(weights))).log_policy
     sensor = FeatureNoise(predicates, p, reportable) * Visibility(view)
     demonstration = imperfect_demonstration(4, toy, log_policy, sensor, 6, 4)
-    expected = stats.norm.logpdf(weights, scale=2.5).sum() + stats.beta.logpdf(p, 3, 1.5).sum()
+    expected = stats.norm.logpdf(weights, scale=2.5 / feature_scale(toy)).sum()
+    expected += stats.beta.logpdf(p, 3, 1.5).sum()
     for codes, length in zip(np.asarray(demonstration.codes), demonstration.lengths, strict=True):
         by_hand = evidence_by_hand(codes[:length], predicates, p, reportable, view)
         expected += enumerate_completions(toy, log_policy, by_hand).log_likelihood
@@ -113,7 +115,8 @@ def test_reliabilities_of_nearly_one_leave_the_law_of_exact_perception(toy, impe
     )
     exact = TrajectoryLaw(toy, weights, Visibility(VIEW), 4).log_prob(codes).sum()
     assert np.isfinite(exact)
-    prior = stats.norm.logpdf(weights, scale=2.5).sum() + stats.beta.logpdf(p, 4, 1).sum()
+    prior = stats.norm.logpdf(weights, scale=2.5 / feature_scale(toy)).sum()
+    prior += stats.beta.logpdf(p, 4, 1).sum()
     assert abs(float(density) - float(exact) - prior) < 1e-9
 
 

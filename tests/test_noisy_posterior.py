@@ -26,6 +26,7 @@ from i2rl.models import (
     sample_demonstration,
 )
 from i2rl.models.demonstration import SEEN, UNKNOWN
+from i2rl.models.units import feature_scale
 
 PREDICATES = np.array([[[1, 0], [1, 1], [0, 1]]], bool)
 VIEW = np.array([1.0, 0.4, 0.8])
@@ -54,7 +55,7 @@ def test_the_posterior_is_that_of_quadrature(toy, demonstration):
     theta, p = (x.ravel() for x in np.meshgrid(np.linspace(-8, 12, 61), (np.arange(60) + 0.5) / 60))
     likelihood = noisy_log_likelihood(jnp.asarray(theta[:, None]), jnp.asarray(p[:, None]), problem)
     log_posterior = np.asarray(likelihood)[:, rows].sum(1)
-    log_posterior += -((theta / 2) ** 2) / 2 + 2 * np.log(p) + 0.5 * np.log(1 - p)
+    log_posterior += -((theta * feature_scale(toy)[0] / 2) ** 2) / 2 + 2 * np.log(p) + 0.5 * np.log(1 - p)
     weight = np.exp(log_posterior - log_posterior.max())
     weight /= weight.sum()
     error = az.mcse(drawn, method="mean")

@@ -12,6 +12,7 @@ from numpyro.infer.util import log_density
 
 from i2rl.models import Demonstration, TabularMDP, Visibility, require_possible, reward_of, soft_plan
 from i2rl.models.occlusion import PRIOR_SCALE, occlusion_model, weights_prior
+from i2rl.models.units import feature_scale
 
 STATES, ACTIONS, FEATURES = 3, 2, 2
 
@@ -68,7 +69,7 @@ def brute_force(mdp, demonstration, weights):
 
 def test_density_is_the_prior_times_the_sum_over_every_completion(mdp, sensor, demonstration):
     weights = jnp.array([0.7, -1.3])
-    prior = dist.Normal(0, PRIOR_SCALE).log_prob(weights).sum()
+    prior = dist.Normal(0, PRIOR_SCALE / feature_scale(mdp)).log_prob(weights).sum()
     expected = prior + brute_force(mdp, demonstration, weights)
     assert density(mdp, sensor, demonstration.codes, weights) == pytest.approx(float(expected), rel=1e-10)
 
