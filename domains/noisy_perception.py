@@ -363,8 +363,7 @@ def demonstrate_noisy(
     presence = noise.presence
     if view is not None:
         presence = view.presence if presence is None else presence * view.presence
-    sensor = Sensor(presence, model)
-    sensor = fitting_sensor(sensor, mdp)
+    sensor = fitting_sensor(Sensor(presence, model), mdp)
     if scores == "product":
         if reliabilities is None:
             reliabilities = (

@@ -135,7 +135,7 @@ def sensor_identifier(
         raise ValueError(
             f"predicates have shape [J, S, A] = [J, {mdp.n_states}, {mdp.n_actions}], got {list(psi.shape)}"
         )
-    seen = Sensor() if view is None else Sensor() * view
+    seen: Imperfection = Sensor() if view is None else Sensor() * view
     if seen.reading is not None:
         raise ValueError("the view says what is hidden; how reports err is fitted, not given")
     seen = fitting_sensor(seen, mdp)

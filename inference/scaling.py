@@ -37,7 +37,7 @@ def _translated(named: Named, weights: Callable[[Any], Any], features: Callable[
 
 def _kept(before: Named, inside: Named, new: Named, after: Named) -> Named:
     """Return ``after``, with what the session left alone as it was to the bit: scaling rounds."""
-    changed = {"weights": jnp.where(new.weights == inside.weights, before.weights, after.weights)}  # type: ignore[attr-defined]
+    changed: dict[str, Any] = {"weights": jnp.where(new.weights == inside.weights, before.weights, after.weights)}  # type: ignore[attr-defined]
     statistic = getattr(after, "statistic", None)
     if isinstance(statistic, FeatureStatistic):
         alone = new.statistic.features == inside.statistic.features  # type: ignore[attr-defined]

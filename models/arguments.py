@@ -70,25 +70,27 @@ def as_key(key: Any) -> Array:
 
 
 def rebuilt_unchecked(cls: Fields) -> Fields:
-    """Let JAX rebuild a checked named tuple from its leaves without calling ``__new__``.
+    """Let JAX, pickles and copies rebuild a checked named tuple without calling ``__new__``.
 
     Leaves are traced, or placeholders without numbers, or arrays that were checked when a user gave them:
     a check of these would cost a copy from the device whenever a compiled function returns. ``_make`` does
     the same in the library's own code; ``_replace`` checks.
     """
-    names = cls._fields
+    fields: Any = cls
+    names = fields._fields
 
     def keyed(value: Any) -> tuple:
         return tuple((jax.tree_util.GetAttrKey(n), x) for n, x in zip(names, value, strict=True)), None
 
     jax.tree_util.register_pytree_with_keys(
-        cls, keyed, lambda _, leaves: cls._make(leaves), lambda value: (tuple(value), None)
+        cls, keyed, lambda _, leaves: fields._make(leaves), lambda value: (tuple(value), None)
     )
 
     def replaced(self: Any, **changes: Any) -> Any:
         return cls(**self._asdict() | changes)
 
-    cls._replace = replaced
+    fields._replace = replaced
+    fields.__reduce__ = lambda self: (fields._make, (tuple(self),))
     return cls
 
 

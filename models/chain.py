@@ -104,8 +104,7 @@ def condition(
     mdp: TabularMDP, belief: Float[Array, " S"], factors: Float[Array, "S A"]
 ) -> Float[Array, " S"]:
     """Distribution of the next state after one step with these factors; zeros if they are impossible."""
-    joint, norm, _ = _weigh(belief, factors)
-    return mdp.push_forward(joint) / jnp.where(norm > 0, norm, 1.0)
+    return mdp.push_forward(_shares(_weigh(belief, factors)[0]))
 
 
 def sample_backward(
@@ -191,7 +190,8 @@ def _forward(mdp: TabularMDP, factors: Float[Array, "L S A"], live: Bool[Array, 
         possible = constant > _TINY
         safe = jnp.where(possible, constant, 1.0)
         log_norm = jnp.where(possible, jnp.log(safe) + scale, -jnp.inf)
-        following = jnp.where(possible, mdp.push_forward(joint), 0.0) / safe
+        # Divided before it is pushed: a rare transition of what is small would be lost.
+        following = jnp.where(possible, mdp.push_forward(joint / safe), 0.0)
         carry = (
             jnp.where(alive, following, predicted),
             total + jnp.where(alive, log_norm, 0.0),
@@ -236,7 +236,7 @@ def _smoothed(mdp: TabularMDP, factors: Array, live: Array, passed: _Forward) ->
         joint, _, scale = _weigh(predicted, factor)
         onward = mdp.expect_next(future)
         message = _message(predicted, factor - scale, onward)
-        return jnp.where(alive, message, future), jnp.where(alive, _shares(joint * onward), 0.0)
+        return jnp.where(alive, message, future), jnp.where(alive, _shares(_shares(joint) * onward), 0.0)
 
     pairs = _back(mdp, step, passed.predicted, factors, live)
     return Smoothed(passed.log_likelihood, pairs, passed.final)
@@ -248,7 +248,8 @@ def _transitions(mdp: TabularMDP, factors: Array, live: Array, passed: _Forward)
         joint, _, scale = _weigh(predicted, factor)
         onward = mdp.probabilities * future[mdp.successors]
         message = _message(predicted, factor - scale, jnp.sum(onward, -1))
-        return jnp.where(alive, message, future), jnp.where(alive, _shares(joint[..., None] * onward), 0.0)
+        pairs = _shares(joint)[..., None]
+        return jnp.where(alive, message, future), jnp.where(alive, _shares(pairs * onward), 0.0)
 
     triples = _back(mdp, step, passed.predicted, factors, live)
     return SmoothedTransitions(passed.log_likelihood, triples)
@@ -289,8 +290,8 @@ def _log_sum(logs: Array, axis: int | tuple[int, ...], weights: Array | float = 
 
 
 def _push_logs(mdp: TabularMDP, pairs: Float[Array, "S A"]) -> Float[Array, " S"]:
-    if mdp.inflow_pairs is not None:
-        return _log_sum(pairs.reshape(-1)[mdp.inflow_pairs], 1, mdp.inflow_probabilities)
+    if mdp.inflow_pairs is not None and (inflow := mdp.inflow_probabilities) is not None:
+        return _log_sum(pairs.reshape(-1)[mdp.inflow_pairs], 1, inflow)
     flow = (pairs[..., None] + _log(mdp.probabilities)).reshape(-1)
     to, n = mdp.successors.reshape(-1), mdp.n_states
     top = lax.stop_gradient(jax.ops.segment_max(flow, to, n))
@@ -308,8 +309,8 @@ def _forward_in_logs(mdp: TabularMDP, factors: Array, live: Array) -> tuple[Arra
         carry = (jnp.where(alive, following, predicted), total + jnp.where(alive, log_norm, 0.0))
         return carry, predicted
 
-    (final, total), predicted = lax.scan(step, (_log(mdp.initial), jnp.zeros(())), (factors, live))
-    return total, predicted, final
+    carry, predicted = lax.scan(step, (_log(mdp.initial), jnp.zeros(())), (factors, live))
+    return carry[1], predicted, carry[0]
 
 
 def _filtered_in_logs(mdp: TabularMDP, factors: Array, live: Array) -> Filtered:

@@ -373,9 +373,8 @@ def _same_labels(psi: Int[Array, "J SA"], logits: Float[Array, " J"]) -> Float[A
 
 def checked_predicates(predicates: ArrayLike) -> Bool[np.ndarray, "J S A"] | Int[np.ndarray, "J S A"]:
     """Predicates as booleans if they are true or false, else as whole numbers; ``ValueError`` otherwise."""
-    if isinstance(predicates, np.ma.MaskedArray):
-        predicates = concrete("predicates", predicates, None)
-    psi = np.asarray(predicates)
+    masked = isinstance(predicates, np.ma.MaskedArray)
+    psi = np.asarray(concrete("predicates", predicates, None) if masked else predicates)
     if psi.ndim != 3 or not psi.size:
         raise ValueError(f"predicates have shape [J, S, A], got {list(psi.shape)}")
     if psi.dtype.kind not in "biuf":

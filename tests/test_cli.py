@@ -369,7 +369,7 @@ def test_bad_lines_are_set_aside_and_counted(house):
     reasons = [json.loads(line)["reason"] for line in (house / "bad.jsonl").read_text().splitlines()]
     for reason, expected in zip(
         reasons,
-        ("not valid JSON", "unknown state 'attic'", "9 steps, more than 8", "more than 900 bytes"),
+        ("not valid JSON", "unknown state 'attic'", "at most 8 steps; it has 9", "at most 900 bytes"),
         strict=True,
     ):
         assert expected in reason
@@ -385,7 +385,7 @@ def test_a_quarantine_is_a_file_of_its_own(house, file):
 
 def test_a_name_of_ten_megabytes_is_cut_in_the_message(house):
     (house / "demos.jsonl").write_text('{"steps": [{"s": "' + "x" * 10**7 + '"}]}\n')
-    assert "more than 4,194,304 bytes" in refused(*options(house))
+    assert "at most 4,194,304 bytes" in refused(*options(house))
     assert len(refused(*options(house, line_bytes=10**8))) < 1100
 
 
@@ -428,7 +428,7 @@ def test_a_broken_line_is_told_and_the_sessions_before_it_are_kept(house):
     result = CliRunner().invoke(app, options(house))
     assert result.exit_code == 1
     assert result.stderr == (
-        "Error: demos.jsonl, line 3, step 1: unknown state 'attic'; known are west, north, east, south, ...\n"
+        "Error: demos.jsonl, line 3, step 1: unknown state 'attic'; known are 'west', 'north', 'east', 'south'\n"
     )
     with Journal.read(house / "learned.db") as view:
         assert view.session == 2

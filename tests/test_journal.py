@@ -1016,6 +1016,7 @@ def test_a_killed_writer_loses_no_session_and_repeats_none(tmp_path: Path) -> No
 
         random.seed(2024)
         path, last = sys.argv[1], [0]
+        run(path, 2)
         for kill in range(14):
             kill_a_writer(path, 0.02 if kill % 2 else 0.15)
             if kill % 4 == 1:  # otherwise the next writer finds what the killed one left
