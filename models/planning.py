@@ -60,7 +60,12 @@ class HardPlan(NamedTuple):
 
 
 def reward_of(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """Reward ``theta . phi(s, a)`` of every pair."""
+    """Reward ``theta . phi(s, a)`` of every pair. Raises ``ValueError`` for a weight of NaN."""
+    if not is_traced(weights) and np.isnan(np.asarray(weights)).any():
+        k = int(np.argwhere(np.isnan(np.asarray(weights)))[0, 0])
+        raise ValueError(
+            f"weights must be numbers; that of feature {_PairNames(mdp.labels).feature(k)} is nan"
+        )
     return mdp.features @ weights
 
 
