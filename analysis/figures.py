@@ -14,7 +14,7 @@ from jaxtyping import Float, Int
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter, PercentFormatter
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, PercentFormatter
 from scipy.stats import binomtest
 
 from .metrics import quantile_band
@@ -254,6 +254,8 @@ def set_scale(axes: Axes, which: str, scale: str) -> None:
     """Scale of the axis ``which``, ``x`` or ``y``: ``linear`` or ``log``, the latter with plain numbers."""
     axis = axes.xaxis if which == "x" else axes.yaxis
     (axes.set_xscale if which == "x" else axes.set_yscale)(scale)
+    if scale == "linear" and which == "x":  # sessions are whole
+        axis.set_major_locator(MaxNLocator(8, integer=True))
     if scale == "log":
         axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))

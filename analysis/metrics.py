@@ -6,7 +6,6 @@ like the expert, and what it loses. Everything is exact: no simulation, no offse
 
 from __future__ import annotations
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -111,8 +110,21 @@ def chance_accuracy(
     :func:`greedy_policy`.
     """
     drawn = jax.random.uniform(key, (draws, mdp.n_features), float, -0.99, 0.99)
-    scores = lax.map(partial(evaluate, mdp, jnp.asarray(true_weights)), drawn, batch_size=16)
-    return np.asarray(scores.accuracy.overall)
+    return np.asarray(behaviour_accuracies(mdp, optimal_actions(mdp, true_weights), drawn))
+
+
+@jax.jit
+def behaviour_accuracies(
+    mdp: TabularMDP, optimal: Bool[Array, "S A"], weights: Float[Array, "N K"]
+) -> Float[Array, " N"]:
+    """LBA of many weights, of features that need not be the true reward's; ``optimal`` is the expert's."""
+
+    def accuracy(learned: Float[Array, " K"]) -> Float[Array, ""]:
+        policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, learned)).optimal)
+        return policy_accuracy(mdp, optimal, policy).overall
+
+    # One after another: batched factorisations may wait for one another on a CPU with few threads.
+    return lax.map(accuracy, weights)
 
 
 def inverse_learning_error(

@@ -358,7 +358,14 @@ def _lead(study: NoisyStudy) -> Lead:
         for row, true in zip(_reward(study) or [], study.task.weights, strict=False)
     ]  # fmt: skip
     if not rows:
-        return Lead(learned, trust)
+        plain_rows = [
+            (name, round(float(weight), 12), float(true))
+            for name, weight, true in zip(
+                study.task.mdp.feature_names, result.weights[0, -1], study.task.weights, strict=True
+            )
+        ]
+        told = "Weights of the first run after its last session, without intervals: no posterior was drawn."
+        return Lead(learned, trust, [Table(("feature", "weight", "true weight"), plain_rows, told)])
     table = Table(
         ("feature", f"weight, {PLAIN}", "posterior median", "95 % interval", "true weight"),
         rows,

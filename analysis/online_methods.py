@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
@@ -26,11 +25,10 @@ from ..inference.session import Learner, run_sessions
 from ..models.demonstration import SEEN, Demonstration
 from ..models.evidence import Sensor
 from ..models.mdp import TabularMDP
-from ..models.planning import deterministic_policy, hard_plan, reward_of
 from .estimates import Estimates, laplace_errors
 from .figures import draw_band, set_scale
 from .information import complete_information
-from .metrics import chance_accuracy, optimal_actions, policy_accuracy, quantile_band
+from .metrics import behaviour_accuracies, chance_accuracy, optimal_actions, quantile_band
 from .page import Lead, Section, Table, drawn, write_page
 from .page import print_tables as print_page_tables
 from .results import plain, study_provenance
@@ -255,23 +253,9 @@ def _accuracies(
         seen = np.cumsum([0, *(int(session.lengths.sum()) for session in sessions)])
         # What was learned at the last session that had ended by then.
         learned = weights[np.searchsorted(seen, points, side="right") - 1]
-        rows.append(np.asarray(_behaviour_accuracy(learner.mdp, optimal, jnp.asarray(learned))))
+        rows.append(np.asarray(behaviour_accuracies(learner.mdp, optimal, jnp.asarray(learned))))
         final.append(weights[-1])
     return np.array(rows), np.array(final)
-
-
-@jax.jit
-def _behaviour_accuracy(
-    mdp: TabularMDP, optimal: Bool[Array, "S A"], weights: Float[Array, "N K"]
-) -> Float[Array, " N"]:
-    """LBA of a reward that need not be of the features the true one is of."""
-
-    def accuracy(weights: Float[Array, " K"]) -> Float[Array, ""]:
-        policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, weights)).optimal)
-        return policy_accuracy(mdp, optimal, policy).overall
-
-    # One after another: batched factorisations may wait for one another on a CPU with few threads.
-    return lax.map(accuracy, weights)
 
 
 # -- telling ------------------------------------------------------------------------------------------

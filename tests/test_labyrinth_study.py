@@ -9,7 +9,9 @@ import jax
 import numpy as np
 import pytest
 from rich.console import Console
+from typer.testing import CliRunner
 
+from i2rl.analysis.cli import app
 from i2rl.analysis.labyrinth import (
     bits_per_decision,
     predict_with_learner,
@@ -209,6 +211,33 @@ def test_the_page_holds_pictures_in_both_themes_and_every_number(result, tmp_pat
     console = Console(file=io.StringIO(), width=140)
     print_tables(result, console)
     assert "a simulated mouse" in console.file.getvalue()
+
+
+@pytest.mark.usefixtures("small_pictures")
+def test_the_command_writes_its_page(result, tmp_path, monkeypatch):
+    asked = {}
+
+    def shared(bouts, **options):
+        asked.update(options, bouts=len(bouts))
+        return result
+
+    monkeypatch.setattr("i2rl.analysis.labyrinth.study", shared)
+    recording = tmp_path / "mouse.jsonl"
+    recording.write_text('{"nodes": [0, 1, 0, 127]}\n' * 2)
+    command = [
+        "run",
+        "labyrinth",
+        "--recording",
+        str(recording),
+        "--report",
+        str(tmp_path / "page"),
+        "--json",
+    ]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    assert (asked["bouts"], asked["recording"]) == (2, "mouse")
+    assert json.loads(done.stdout) == json.loads((tmp_path / "page" / "results.json").read_text())
+    assert (tmp_path / "page" / "index.html").exists()
 
 
 def test_weights_come_with_intervals_that_hold_most_of_the_true_ones(result):

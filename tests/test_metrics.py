@@ -139,6 +139,18 @@ def test_relative_error_is_undefined_without_reward() -> None:
     assert np.isnan(result.relative)
 
 
+def test_chance_is_the_accuracy_of_weights_drawn_at_random() -> None:
+    key, mdp = jax.random.key(4), corridor()
+    found = metrics.chance_accuracy(key, mdp, jnp.array([1.0, 0.0]), 40)
+    drawn = np.asarray(jax.random.uniform(key, (40, 2), float, -0.99, 0.99))
+    alone = [float(metrics.evaluate(mdp, [1.0, 0.0], list(w)).accuracy.overall) for w in drawn[:8]]
+    np.testing.assert_allclose(found[:8], alone)
+    # Whoever likes the left end and not the right one acts as the expert; the other way round nobody does.
+    assert (found[(drawn[:, 0] > 0) & (drawn[:, 1] < 0)] == 1).all()
+    assert (found[(drawn[:, 0] < 0) & (drawn[:, 1] > 0)] == 0).all()
+    assert found.min() < found.max()
+
+
 def test_evaluation_maps_over_many_weights() -> None:
     mdp = corridor()
     weights = jnp.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.9]])
