@@ -35,7 +35,9 @@ def _translated(named: Any, weights: Callable[[Any], Any], features: Callable[[A
 
 def _kept(before: Any, inside: Any, new: Any, after: Any) -> Any:
     """Return ``after``, with what the session left alone as it was to the bit: scaling rounds."""
-    changed = {"weights": jnp.where(new.weights == inside.weights, before.weights, after.weights)}
+    changed: dict[str, Any] = {
+        "weights": jnp.where(new.weights == inside.weights, before.weights, after.weights)
+    }
     statistic = getattr(after, "statistic", None)
     if isinstance(statistic, FeatureStatistic):
         alone = new.statistic.features == inside.statistic.features

@@ -42,7 +42,7 @@ def feature_scale(mdp: TabularMDP) -> Float[Array, " K"]:
     return _largest(np, np.asarray(mdp.features), np.asarray(mdp.available))
 
 
-def _largest(xp: Any, features: Float[Array, "S A K"], available: Array) -> Float[Array, " K"]:
+def _largest(xp: Any, features: Any, available: Any) -> Float[Array, " K"]:
     largest = xp.max(xp.where(available[..., None], xp.abs(features), 0.0), axis=(0, 1))
     return xp.where(largest > 0, largest, 1.0)
 
