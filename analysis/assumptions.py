@@ -16,6 +16,7 @@ from jaxtyping import Float
 from ..inference.session import Learner
 from ..models.mdp import TabularMDP
 from ..models.planning import feature_expectations, reward_of, soft_plan
+from ..models.units import feature_scale
 
 # A trajectory is whole if what discounting leaves beyond its end is this share of epsilon at most.
 _NEGLIGIBLE = 0.1
@@ -255,9 +256,11 @@ def _solved(learner: Learner, state: Any, bound: Bound) -> tuple[bool, str]:
     """Whether the weights are feasible, and optimal up to a thousandth of the bound."""
     if learner.configuration.get("statistic") != "features":
         return False, "another program was solved"
-    mdp, weights = learner.mdp, state.weights
+    mdp, weights, scale = learner.mdp, state.weights, feature_scale(learner.mdp)
     policy = soft_plan(mdp, reward_of(mdp, weights)).policy
-    miss = feature_expectations(mdp, policy, state.statistic.start) - state.statistic.features
+    # The program's constraints are on scaled features.
+    miss = (feature_expectations(mdp, policy, state.statistic.start) - state.statistic.features) / scale
+    weights = weights * scale
     unit = 1 - float(mdp.discount)
     gap = unit * float(jnp.max(jnp.abs(miss)))
     # Complementary slackness: zero at the program's solution, and what else it could gain elsewhere.

@@ -271,8 +271,9 @@ def monotonicity(
 class ObservedBound(NamedTuple):
     """A bound computed from the features that were observed.
 
-    ``target [K]`` and ``slack [K]`` are what the maximum-entropy program has to be given (units of
-    ``phi_hat``) for ``bound`` to hold of its solution.
+    ``target [K]`` and ``slack [K]`` are what the maximum-entropy program has to be given for ``bound`` to
+    hold of its solution. Both are in units of ``phi_hat``: the program takes ``slack`` divided by
+    :func:`~i2rl.models.feature_scale`.
     """
 
     target: Float[np.ndarray, " K"]

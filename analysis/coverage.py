@@ -30,6 +30,7 @@ from ..models.demonstration import Demonstration
 from ..models.evidence import Imperfection, observe, step_log_evidence
 from ..models.mdp import TabularMDP
 from ..models.planning import features_to_go, reward_of, simulate, soft_plan
+from ..models.units import feature_scale
 from .bounds import (
     error_for,
     lme_constraint_bound,
@@ -189,12 +190,15 @@ def expected_gaps(
 ) -> Float[Array, " runs"]:
     """``LL(theta_E) - LL(theta)`` of each program's solution, in expectation over the expert's trajectories.
 
+    ``slacks`` are in units of the features as given.
     Nats per trajectory; never negative (Gibbs' inequality).
     """
 
+    scale = feature_scale(mdp)
+
     def one(inputs: tuple) -> Float[Array, ""]:
         target, slack = inputs
-        learned = solve_dual(mdp, FeatureTarget(target, mdp.initial), slack)
+        learned = solve_dual(mdp, FeatureTarget(target, mdp.initial), slack / scale)
         return expected_gap(mdp, expert, learned.weights, learned.values)
 
     return lax.map(one, (targets, slacks), batch_size=64)

@@ -135,7 +135,7 @@ class _SoftBellmanProgram:
             + ca.dot(slack, plus + minus)
             + ridge / 2 * ca.dot(theta, theta)
             + proximal / 2 * ca.dot(theta - centre, theta - centre),
-            "g": _soft_maximum(advantage, state),
+            "g": soft_maximum(advantage, state),
         }
         # Strictly feasible: IPOPT leaves the boundary in directions that lead it far astray.
         values = soft_values(mdp, jnp.zeros(n_features)) + 1 / (1 - mdp.discount)
@@ -338,7 +338,7 @@ class CountProgram(_SoftBellmanProgram):
         return solution
 
 
-def _soft_maximum(advantage: ca.SX, state: np.ndarray) -> ca.SX:
+def soft_maximum(advantage: ca.SX, state: np.ndarray) -> ca.SX:
     """``log sum_a exp(advantage)`` of each state, exponents shifted so that the largest is zero."""
     maxima = []
     for s in range(state[-1] + 1):

@@ -38,6 +38,7 @@ from ..models.units import feature_scale, with_scaled_features
 from .entropic import entropic_proportions
 from .maxent import WarmStart, fit_scaled_counts, soft_values
 from .maxent_constraints import ProgramNotSolved, flow_constraints
+from .maxent_dual import soft_maximum
 
 _COLD: dict[str, Any] = {
     "ipopt.print_level": 0,
@@ -151,7 +152,7 @@ class MinMaxProgram:
         self._scaled = mdp = with_scaled_features(mdp)
         self._flow = flow_constraints(mdp, np.ones(mdp.n_states, bool))
         n_states, n_features = mdp.n_states, mdp.n_features
-        size, pairs = (trajectories, components), len(self._flow.pair_state)
+        size = (trajectories, components)
         v, pi = ca.SX.sym("v", *size), ca.SX.sym("pi", components)
         parts, values = ca.SX.sym("parts", 2 * n_features, components), ca.SX.sym("V", n_states, components)
         features = [ca.SX.sym(f"F{d}", trajectories, n_features) for d in range(components)]
@@ -160,7 +161,6 @@ class MinMaxProgram:
         strength, price = ca.SX.sym("strength"), ca.SX.sym("price")
         l1, ridge = ca.SX.sym("l1", n_features), ca.SX.sym("ridge")
         theta = parts[:n_features, :] - parts[n_features:, :]
-        at_state = sparse.csc_matrix((np.ones(pairs), (self._flow.row, np.arange(pairs))), (n_states, pairs))
         phi = ca.sparsify(ca.DM(self._flow.features))
         advantage = phi @ theta - ca.DM(sparse.csc_matrix(self._flow.balance)).T @ values
         likelihoods = ca.horzcat(
@@ -173,13 +173,14 @@ class MinMaxProgram:
             - ca.dot(l1, ca.sum2(parts[:n_features, :] + parts[n_features:, :]))
             - ridge / 2 * ca.dot(theta, theta)
         )
+        maxima = [soft_maximum(advantage[:, d], self._flow.row) for d in range(components)]
         program = {
             "x": ca.vertcat(ca.vec(v), pi, ca.vec(parts), ca.vec(values)),
             "p": ca.vertcat(
                 *map(ca.vec, features), *map(ca.vec, state_weights), counted, strength, price, l1, ridge
             ),
             "f": -objective,
-            "g": ca.vertcat(ca.sum2(v), ca.sum1(pi), ca.vec(ca.log(ca.DM(at_state) @ ca.exp(advantage)))),
+            "g": ca.vertcat(ca.sum2(v), ca.sum1(pi), *maxima),
         }
         self._cold = ca.nlpsol("minmax_cold", "ipopt", program, _COLD)
         self._warm = ca.nlpsol("minmax_warm", "ipopt", program, _WARM)

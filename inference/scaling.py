@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any, TypeVar
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -14,36 +14,36 @@ from ..models.units import feature_scale, with_scaled_features
 from .session import Learner
 from .statistic import FeatureStatistic
 
-Named = TypeVar("Named", bound=tuple)
 
-
-def unscaled(named: Named, scale: Float[Array, " K"]) -> Named:
+def unscaled(named: Any, scale: Float[Array, " K"]) -> Any:
     """Return a named tuple whose scaled weights, and features it keeps, are in the units as given."""
     return _translated(named, lambda weights: weights / scale, lambda features: features * scale)
 
 
-def scaled(named: Named, scale: Float[Array, " K"]) -> Named:
+def scaled(named: Any, scale: Float[Array, " K"]) -> Any:
     """Return a named tuple whose weights and features are scaled; :func:`unscaled` is the way back."""
     return _translated(named, lambda weights: weights * scale, lambda features: features / scale)
 
 
-def _translated(named: Named, weights: Callable[[Any], Any], features: Callable[[Any], Any]) -> Named:
-    changed: dict[str, Any] = {"weights": weights(named.weights)}  # type: ignore[attr-defined]
+def _translated(named: Any, weights: Callable[[Any], Any], features: Callable[[Any], Any]) -> Any:
+    changed: dict[str, Any] = {"weights": weights(named.weights)}
     statistic = getattr(named, "statistic", None)
     if isinstance(statistic, FeatureStatistic):
         changed["statistic"] = statistic._replace(features=features(statistic.features))
-    return named._replace(**changed)  # type: ignore[attr-defined]
+    return named._replace(**changed)
 
 
-def _kept(before: Named, inside: Named, new: Named, after: Named) -> Named:
+def _kept(before: Any, inside: Any, new: Any, after: Any) -> Any:
     """Return ``after``, with what the session left alone as it was to the bit: scaling rounds."""
-    changed: dict[str, Any] = {"weights": jnp.where(new.weights == inside.weights, before.weights, after.weights)}  # type: ignore[attr-defined]
+    changed: dict[str, Any] = {
+        "weights": jnp.where(new.weights == inside.weights, before.weights, after.weights)
+    }
     statistic = getattr(after, "statistic", None)
     if isinstance(statistic, FeatureStatistic):
-        alone = new.statistic.features == inside.statistic.features  # type: ignore[attr-defined]
-        features = jnp.where(alone, before.statistic.features, statistic.features)  # type: ignore[attr-defined]
+        alone = new.statistic.features == inside.statistic.features
+        features = jnp.where(alone, before.statistic.features, statistic.features)
         changed["statistic"] = statistic._replace(features=features)
-    return after._replace(**changed)  # type: ignore[attr-defined]
+    return after._replace(**changed)
 
 
 def on_scaled_features(mdp: TabularMDP, build: Callable[[TabularMDP], Learner]) -> Learner:

@@ -28,7 +28,7 @@ from i2rl.analysis.bounds import (
     table_7_1b,
 )
 from i2rl.inference import FeatureTarget, solve_dual
-from i2rl.models import feature_expectations, reward_of, soft_plan
+from i2rl.models import feature_expectations, feature_scale, reward_of, soft_plan
 
 
 def test_table_7_1a_is_reproduced():
@@ -91,7 +91,7 @@ def test_the_programs_solution_never_loses_more_than_the_sure_gap(random_mdp):
         features = feature_expectations(mdp, other)
         epsilon = 0.05
         slack = epsilon / (1 - mdp.discount)
-        solution = solve_dual(mdp, FeatureTarget(features, mdp.initial), slack)
+        solution = solve_dual(mdp, FeatureTarget(features, mdp.initial), slack / feature_scale(mdp))
 
         def likelihood(weights, mdp=mdp, features=features):
             return weights @ features - mdp.initial @ soft_plan(mdp, reward_of(mdp, weights)).values
@@ -168,7 +168,7 @@ def test_an_observed_bound_covers_the_expected_likelihood(random_mdp):
 
     @jax.jit
     def gap(target, slack):
-        learned = solve_dual(mdp, FeatureTarget(target, mdp.initial), slack)
+        learned = solve_dual(mdp, FeatureTarget(target, mdp.initial), slack / feature_scale(mdp))
         return (weights - learned.weights) @ mean - mdp.initial @ (plan.values - learned.values)
 
     covered = []

@@ -428,7 +428,8 @@ def test_a_broken_line_is_told_and_the_sessions_before_it_are_kept(house):
     result = CliRunner().invoke(app, options(house))
     assert result.exit_code == 1
     assert result.stderr == (
-        "Error: demos.jsonl, line 3, step 1: unknown state 'attic'; known are 'west', 'north', 'east', 'south'\n"
+        "Error: demos.jsonl, line 3, step 1: unknown state 'attic'; "
+        "known are 'west', 'north', 'east', 'south'\n"
     )
     with Journal.read(house / "learned.db") as view:
         assert view.session == 2

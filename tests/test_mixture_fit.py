@@ -27,6 +27,7 @@ from i2rl.inference.mtirl import assign_trajectories
 from i2rl.models import Demonstration, TrajectoryLaw, Visibility
 from i2rl.models.demonstration import HIDDEN, LOST
 from i2rl.models.planning import reachable_states, reward_of, soft_plan
+from i2rl.models.units import with_scaled_features
 
 WAYS, LENGTH = 3, 10
 climbed, merged = jax.jit(climb), jax.jit(_merge_once)
@@ -34,7 +35,8 @@ climbed, merged = jax.jit(climb), jax.jit(_merge_once)
 
 @pytest.fixture(scope="module")
 def mdp(random_mdp):
-    return random_mdp(3, n_states=5, n_features=3, masked=True)
+    # Mixtures are fitted to scaled features.
+    return with_scaled_features(random_mdp(3, n_states=5, n_features=3, masked=True))
 
 
 @pytest.fixture(scope="module")

@@ -148,9 +148,9 @@ METHODS: Mapping[str, Callable[[TabularMDP], Array | np.ndarray]] = {
     "mlirl": lambda mdp: mlirl(KEY, mdp, demonstration(), restarts=2, iterations=40).weights,
     "em_mlirl": lambda mdp: em_mlirl(mdp, clusters=2, iterations=4).fit(KEY, demonstration()).weights,
     "dpm_birl": lambda mdp: dpm_birl(mdp, sweeps=15, sigma=0.1).fit(KEY, demonstration()).weights,
-    "birl": lambda mdp: birl(
-        KEY, mdp, demonstration(), draws=30, warmup=30, chains=2
-    )["posterior"].weights.values[0],
+    "birl": lambda mdp: birl(KEY, mdp, demonstration(), draws=30, warmup=30, chains=2)["posterior"][
+        "weights"
+    ].values[0],
     "batch_mme_mtirl": lambda mdp: batch_mme_mtirl(mdp, ways=2, restarts=1).fit(KEY, demonstration()).weights,
     "posterior mode": _mode,
     "lme_i2rl": _learned(lambda mdp: lme_i2rl(mdp, VIEW), "hidden"),
@@ -251,7 +251,7 @@ def solve_both(seed: int, kind: str, program: str, length: float = 1.0) -> Solve
             newton, ipopt = solve_dual(mdp, aim), DualProgram(mdp).solve(aim)
         else:
             visits = np.random.default_rng(seed).poisson(60 * np.asarray(occupancy(mdp, expert)))
-            newton, ipopt = fit_counts(mdp, jnp.asarray(visits)), CountProgram(mdp).solve(visits)
+            newton, ipopt = fit_counts(mdp, jnp.asarray(visits, float)), CountProgram(mdp).solve(visits)
     except (RuntimeError, ValueError) as error:
         return Solved(str(error), np.nan, np.nan, 0)
     apart = np.abs(policies(mdp, ipopt.weights) - policies(mdp, newton.weights)).max()
