@@ -461,7 +461,7 @@ def learn(
     """
     import jax
 
-    from ..inference.journal import Journal
+    from ..inference.journal import Journal, journal_files, require_apart
     from ..inference.lme import DEFAULT_SLACK, lme_i2rl
     from ..models.demonstration import LineLimits
     from .quarantine import Quarantine
@@ -481,7 +481,7 @@ def learn(
         learner = learner._replace(configuration={**learner.configuration, **stream})
         limits = LineLimits(line_bytes, line_steps)
         if quarantine is not None:
-            _require_apart(quarantine, demos, journal)
+            require_apart("--quarantine", quarantine, demos, *journal_files(journal))
         lines, source = open_lines(demos, follow, limits, skip=quarantine is not None, say=_say)
         with Journal.open(journal, learner) as opened, _progress(as_json) as advance:
             before = opened.session
@@ -512,15 +512,6 @@ def learn(
                 print(f"{done} sessions learned ({before} were in {journal} before).")
 
 
-def _require_apart(quarantine: Path, *others: str | Path) -> None:
-    """Refuse a quarantine that is a file which the command reads or writes otherwise."""
-    for other in map(Path, others):
-        if quarantine.resolve() == other.resolve() or (
-            other.exists() and quarantine.exists() and quarantine.samefile(other)
-        ):
-            raise ValueError(f"--quarantine must be a file of its own; got {quarantine}, which is {other}")
-
-
 @app.command()
 def show(
     journal: Annotated[Path, typer.Argument(help="A journal written by learn.")],
@@ -538,6 +529,9 @@ def show(
     from ..inference.journal import Journal
 
     with _reported_errors(), Journal.read(journal) as view:
+        if view.lacks_log:
+            _say(f"Sessions may be missing: {journal} was moved or copied without its {journal}-wal while a "
+                 "learner had it open, or after a kill.")  # fmt: skip
         if verify:
             _say(f"All {view.verify()} sessions are as they were committed.")
         if export is not None:
@@ -748,6 +742,8 @@ def _print_rewards(console: Console, names: Sequence[str], weights: ArrayLike, t
 def main() -> None:
     """Entry point of the ``i2rl`` command."""
     sys.unraisablehook = _interrupt_again
+    if sys.stdout is None:  # closed by whoever started this
+        sys.stdout = open(os.devnull, "w")  # noqa: SIM115
     app()
 
 

@@ -152,6 +152,8 @@ def open_lines(
     say = partial(print, file=sys.stderr) if say is None else say
     if path == "-":
         source = "standard input"
+        if sys.stdin is None:
+            raise ValueError("standard input is closed: give a file with --demos")
         pieces = iter(partial(sys.stdin.buffer.readline, _PIECE), b"")
     else:
         source = os.path.basename(path)

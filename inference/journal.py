@@ -296,7 +296,15 @@ class JournalView:
     Every call reads one consistent moment and takes no lock that a writer waits for, so a view of a running
     learner's journal shows more sessions as they are committed. Close it, or use it as a context manager.
     One thread at a time.
+
+    Attributes
+    ----------
+    lacks_log : bool
+        Whether the file was moved or copied without its ``-wal`` while a learner had it open or after a kill,
+        so that sessions may be missing.
     """
+
+    lacks_log = False
 
     def __init__(self, path: Path, connection: sqlite3.Connection, in_use: InUse) -> None:
         self.path = path
@@ -328,6 +336,8 @@ class JournalView:
 
         Raises :class:`JournalError` naming one that is damaged, or between which two something is missing.
         """
+        if last is not None and not (isinstance(last, int) and 0 < last < 2**63):
+            raise ValueError(f"`last` must be a positive number of sessions; got {shortened(last)}")
         for row in self._verified(last):
             yield self._record(row)
 
@@ -385,7 +395,11 @@ class JournalView:
         return arviz.InferenceData(sessions=_dataset(list(self.reports()), self.origin))
 
     def to_netcdf(self, filename: str | os.PathLike[str]) -> None:
-        """Write :meth:`to_inference_data` as NetCDF, to be read by ``arviz.from_netcdf``."""
+        """Write :meth:`to_inference_data` as NetCDF, to be read by ``arviz.from_netcdf``.
+
+        Raises ``ValueError`` for a file of the journal itself.
+        """
+        require_apart("filename", filename, *journal_files(self.path))
         self.to_inference_data().to_netcdf(os.fspath(filename), engine="h5netcdf")
 
     def close(self) -> None:
@@ -562,7 +576,11 @@ class Journal(JournalView):
         is no journal (it is left as it was), was made by a newer version, belongs to another MDP, method or
         configuration, is damaged, or cannot be read or written.
         """
-        path = Path(path).resolve()
+        if not hasattr(learner, "signature"):
+            raise TypeError(
+                f"`learner` must be a learner such as lme_i2rl(mdp, sensor); got {shortened(learner)}"
+            )
+        path = journal_files(path)[0]
         _refuse_foreign(path)
         with ExitStack() as opened:
             lock = opened.enter_context(Lock(path))
@@ -606,11 +624,12 @@ class Journal(JournalView):
 
         Raises :class:`JournalError` where there is no journal, it was made by a newer version, or is damaged.
         """
-        path = Path(path).resolve()
+        path = journal_files(path)[0]
         if not path.exists():
             raise JournalError(f"{path} does not exist")
         _refuse_foreign(path)
         with explained(path, "be read"), ExitStack() as opened:
+            lacks_log = _lacks_log(path)
             in_use = InUse(path)
             opened.callback(in_use.release)
             # Not opened read-only: what a killed writer left half done is then undone before it is read.
@@ -623,6 +642,7 @@ class Journal(JournalView):
                 )
             _require_readable(connection, path)
             view = JournalView(path, connection, in_use)
+            view.lacks_log = lacks_log
             opened.pop_all()
             return view
 
@@ -808,6 +828,36 @@ def _require_alone(connection: sqlite3.Connection, lock: Lock) -> None:
     )
 
 
+def journal_files(path: str | os.PathLike[str]) -> tuple[Path, ...]:
+    """Return every file that belongs to the journal at a path: itself, its log, and its lock.
+
+    Raises :class:`JournalError` for a path that leads nowhere (a circle of links, a name too long).
+    """
+    try:
+        path = Path(path).resolve()
+        path.exists()
+    except (OSError, RuntimeError, ValueError) as error:
+        raise JournalError(f"{shortened(os.fspath(path))} cannot be read: {error}") from None
+    return (path, *(path.with_name(path.name + suffix) for suffix in ("-wal", "-shm", "-journal", "-lock")))
+
+
+def require_apart(argument: str, given: str | os.PathLike[str], *others: str | os.PathLike[str]) -> None:
+    """Raise ``ValueError`` for a file to be written that is another file in use, by whatever name."""
+    wanted = Path(given)
+    for other in map(Path, others):
+        same = other.exists() and wanted.exists() and wanted.samefile(other)
+        if same or wanted.resolve() == other.resolve():
+            raise ValueError(f"`{argument}` must be a file of its own; got {wanted}, which is {other}")
+
+
+def _lacks_log(path: Path) -> bool:
+    """Say whether a journal was being written when it was last closed, and its log is not beside it."""
+    if not path.exists() or path.with_name(path.name + "-wal").exists():
+        return False
+    header = header_of(path) or b""
+    return header[18:20] == b"\x02\x02"
+
+
 def _refuse_foreign(path: Path) -> None:
     """Refuse a file that is not a readable journal before anything is written to it or next to it."""
     if path.exists() and not path.is_file():
@@ -831,6 +881,10 @@ def _refuse_foreign(path: Path) -> None:
 def _require_readable(connection: sqlite3.Connection, path: Path) -> None:
     application = connection.execute("PRAGMA application_id").fetchone()[0]
     _require_ours(application, connection.execute("PRAGMA user_version").fetchone()[0], path)
+    # What is no table could compute without end, or change what is committed.
+    query = "SELECT type, name FROM sqlite_master WHERE type IN ('view', 'trigger')"
+    if (found := connection.execute(query).fetchone()) is not None:
+        raise JournalError(f"{path} is damaged: it has the {found[0]} {shortened(found[1])}")
 
 
 def _require_ours(application: int, version: int, path: Path) -> None:

@@ -309,8 +309,9 @@ def _forward_in_logs(mdp: TabularMDP, factors: Array, live: Array) -> tuple[Arra
         carry = (jnp.where(alive, following, predicted), total + jnp.where(alive, log_norm, 0.0))
         return carry, predicted
 
-    carry, predicted = lax.scan(step, (_log(mdp.initial), jnp.zeros(())), (factors, live))
-    return carry[1], predicted, carry[0]
+    passed: tuple = lax.scan(step, (_log(mdp.initial), jnp.zeros(())), (factors, live))
+    (final, total), predicted = passed
+    return total, predicted, final
 
 
 def _filtered_in_logs(mdp: TabularMDP, factors: Array, live: Array) -> Filtered:

@@ -238,6 +238,8 @@ def _row(steps: Any, names: _Names, trajectory: int) -> list[tuple[int, int, int
             f"a trajectory must be a list of steps or an array [L, 2]; got {shortened(steps)} "
             f"(trajectory {trajectory})"
         )
+    if hasattr(steps, "__array__") and getattr(steps, "ndim", 0) == 2 and not np.ma.isMaskedArray(steps):
+        steps = np.asarray(steps)
     row = []
     for t, step in enumerate(steps):
         if isinstance(step, list) or (isinstance(step, np.ndarray) and step.ndim):
@@ -324,6 +326,11 @@ def _numbers(name: str, given: Any, missing: float | None) -> tuple[np.ndarray, 
         raise ValueError(f"{name} must have shape [n, L] or [L] with at least one step, got {array.shape}")
     absent = np.broadcast_to(absent, array.shape)
     if missing is not None:
+        if not isinstance(missing, int | float | np.number):
+            raise TypeError(
+                f"`missing` must be a number that stands for what was not seen; got {shortened(missing)}; "
+                "missing values of pandas and masks are found without it"
+            )
         absent = absent | (np.isnan(array) if missing != missing else array == missing)
     return np.atleast_2d(array), np.atleast_2d(absent)
 
@@ -480,7 +487,9 @@ def parsed_lines(
     :class:`DemonstrationError` naming ``source`` and line for what is not JSON, and for lines longer than
     ``limits.size``; ``TypeError`` for what is not lines.
     """
-    if isinstance(lines, str | bytes | PurePath):
+    if not isinstance(limits, LineLimits):
+        raise TypeError(f"limits must be LineLimits(size, steps); got {shortened(limits)}")
+    if isinstance(lines, str | bytes | PurePath) or not hasattr(lines, "__iter__"):
         raise TypeError(f"lines must be an open file or a list of lines; got {shortened(lines)}")
     for number, line in enumerate(_decodable(lines, source, first_line), start=first_line):
         where = f"{source}, line {number}"
@@ -516,6 +525,8 @@ def _decodable(lines: Iterable[str | bytes], source: str, first_line: int) -> It
         raise DemonstrationError(
             f"{source}, line {read + 1} or later: not UTF-8 text (byte {error.object[error.start]:#04x})"
         ) from None
+    except (EOFError, OSError) as error:  # of a compressed file, say
+        raise DemonstrationError(f"{source}, line {read + 1} or later cannot be read: {error}") from None
 
 
 def read_trajectories(
@@ -608,6 +619,8 @@ def write_trajectories(
     """
     if not hasattr(file, "write"):
         raise TypeError(f"file must be a file open for writing text; got {shortened(file)}")
+    if not isinstance(demonstration, Demonstration):
+        raise TypeError(f"demonstration must be a Demonstration; got {shortened(demonstration)}")
     names = _Names(mdp)
     n = demonstration.n_trajectories
     extra = {"id": _per_row("ids", ids, n, text=True), "agent": _per_row("agents", agents, n, text=False)}
@@ -654,8 +667,12 @@ def _per_row(field: str, given: Iterable[Any] | None, n: int, *, text: bool) -> 
         raise ValueError(f"{len(entries)} {field} were given for {n} trajectories")
     for i, entry in enumerate(entries):
         if isinstance(entry, int | np.integer) and not isinstance(entry, bool):
+            if not text and not -(2**63) <= entry < 2**63:
+                raise ValueError(
+                    f"{field} must be integers of 64 bits; got {shortened(entry)} (trajectory {i})"
+                )
             entries[i] = str(entry) if text else int(entry)
-        elif not text or not isinstance(entry, str):
+        elif not text or not isinstance(entry, str) or _SURROGATE.search(entry):
             wanted = "text or integers" if text else "integers"
             raise TypeError(f"{field} must be {wanted}; got {shortened(entry)} (trajectory {i})")
     return entries

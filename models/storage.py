@@ -37,6 +37,8 @@ def save_mdp(path: str | os.PathLike[str], mdp: TabularMDP, in_view: np.ndarray 
     path that does not end in ``.npz`` (NumPy would add it), a view of the wrong shape or outside [0, 1], and
     names that end in a NUL character (NumPy would drop it).
     """
+    if not isinstance(mdp, TabularMDP):
+        raise TypeError(f"mdp must be a TabularMDP; got {shortened(mdp)}")
     if not str(path).endswith(".npz"):
         raise ValueError(f"an MDP archive ends in .npz, got {path}")
     if in_view is not None and np.shape(in_view) != (mdp.n_states,):
@@ -66,6 +68,8 @@ def load_mdp(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Sto
     try:
         options: dict[str, Any] = {n: arrays[n] for n in ("initial", "available") if n in arrays}
         if "discount" in arrays:
+            if arrays["discount"].ndim:
+                raise ValueError(f"discount must be one number; got shape {list(arrays['discount'].shape)}")
             options["discount"] = float(arrays["discount"])
         options |= {name: _names(name, arrays[name]) for name in _NAMES if name in arrays}
         mdp = TabularMDP.from_successors(

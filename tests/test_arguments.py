@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import copy
+import pickle
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -342,3 +345,12 @@ def test_traced_arguments_have_no_numbers():
     assert concrete("x", 1).dtype == float
     with pytest.raises(TypeError, match="real numbers"):
         concrete("x", 1j)
+
+
+def test_sensors_that_jax_rebuilt_are_copied_and_pickled():
+    mapped = jax.vmap(Visibility)(jnp.full((2, 3), 0.5))
+    slope = jax.grad(lambda view: 3 * view.in_view.sum())(Visibility([0.2, 0.7, 1.0]))
+    for sensor in (mapped, slope, Sensor(jnp.ones(3)), jax.tree.map(lambda x: x.shape, mapped)):
+        for again in (copy.copy(sensor), copy.deepcopy(sensor), pickle.loads(pickle.dumps(sensor))):
+            assert type(again) is type(sensor)
+            jax.tree.map(np.testing.assert_array_equal, again, sensor)

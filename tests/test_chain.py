@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from i2rl.models import TabularMDP
-from i2rl.models.chain import filter_forward, sample_backward, smooth, smooth_all
+from i2rl.models.chain import condition, filter_forward, sample_backward, smooth, smooth_all
 
 S, A, L = 4, 3, 5
 
@@ -279,3 +279,28 @@ def test_a_trajectory_does_not_depend_on_the_ones_beside_it(wide_problems):
         np.testing.assert_allclose(together.pairs[i], alone.pairs, atol=1e-14)
     mapped = jax.jit(jax.vmap(filter_forward, (None, 0, 0)))(mdp, factors, live)
     np.testing.assert_allclose(mapped.log_likelihood, together.log_likelihood, rtol=1e-14)
+
+
+def test_a_path_of_several_rare_steps_is_not_lost():
+    # Policy e^-318, transition e^-318, then e^-210 of the state that is certain by now.
+    first, second = np.exp(-318.0), np.exp(-210.0)
+    moves = np.zeros((5, 2, 5))
+    moves[0, 0, 1], moves[0, 1, 1], moves[0, 1, 2] = 1, 1 - first, first
+    moves[1, :, 3] = moves[3, :, 3] = moves[4, :, 4] = 1
+    moves[2, :, 4], moves[2, :, 3] = second, 1 - second
+    mdp = TabularMDP.from_dense(moves, np.zeros((5, 2, 1)), initial=np.eye(5)[0])
+    factors = np.zeros((3, 5, 2))
+    factors[0, 0, 1], factors[1, 1], factors[2, 3] = -318, -np.inf, -240
+    for process in (mdp, mdp.without_inflow()):
+        result = smooth(process, jnp.asarray(factors), jnp.ones(3, bool))
+        assert float(result.log_likelihood) == pytest.approx(-318 - 318 - 210 + 2 * np.log(2), abs=1e-9)
+        assert float(result.final[4]) == pytest.approx(1, abs=1e-12)
+
+
+def test_the_next_state_after_a_certain_but_unlikely_one_is_not_lost():
+    moves = np.zeros((3, 1, 3))
+    moves[0, 0, 0] = moves[2, 0, 2] = 1
+    moves[1, 0, 0], moves[1, 0, 1] = np.exp(-210.0), 1 - np.exp(-210.0)
+    mdp = TabularMDP.from_dense(moves, np.zeros((3, 1, 1)))
+    following = condition(mdp, jnp.array([0, np.exp(-600.0), 1.0]), jnp.array([[0.0], [0.0], [-jnp.inf]]))
+    assert float(following[0]) == pytest.approx(np.exp(-210.0), rel=1e-9)

@@ -8,6 +8,7 @@ import struct
 import subprocess
 import sys
 import textwrap
+from contextlib import closing
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -103,6 +104,12 @@ def learned(learner: Toy, sessions: int, state: State | None = None) -> list[tup
         state, report = learner.update(state, jnp.arange(2.0) + state.session)
         history.append((state, report))
     return history
+
+
+def committed(path: Path, learner: Toy, sessions: int) -> None:
+    with Journal.open(path, learner) as journal:
+        for state, report in learned(learner, sessions):
+            journal.commit(state, report)
 
 
 def bits(tree: Any) -> list[tuple]:
@@ -1171,3 +1178,56 @@ def test_the_history_leaves_as_inference_data(learner: Toy, tmp_path: Path) -> N
 def test_an_empty_history_leaves_as_inference_data(learner: Toy, tmp_path: Path) -> None:
     with Journal.open(tmp_path / "j", learner) as journal:
         assert journal.to_inference_data()["sessions"].sizes["session"] == 0
+
+
+def test_an_export_onto_a_file_of_the_journal_is_refused(learner: Toy, tmp_path: Path) -> None:
+    committed(tmp_path / "j", learner, 2)
+    with Journal.read(tmp_path / "j") as view:
+        for suffix in ("", "-wal", "-shm", "-journal", "-lock"):
+            with pytest.raises(ValueError, match="must be a file of its own"):
+                view.to_netcdf(tmp_path / f"j{suffix}")
+        assert view.verify() == 2
+
+
+def test_a_journal_that_was_moved_without_its_log_says_so(learner: Toy, tmp_path: Path) -> None:
+    history = learned(learner, 2)
+    with Journal.open(tmp_path / "j", learner) as journal:
+        journal.commit(*history[0])
+        shutil.copy(tmp_path / "j", tmp_path / "alone")
+    with Journal.read(tmp_path / "alone") as view:
+        assert view.lacks_log
+    with Journal.read(tmp_path / "j") as view:
+        assert not view.lacks_log
+        assert view.verify() == 1
+
+
+@pytest.mark.parametrize(
+    "statements",
+    [
+        "CREATE TRIGGER t AFTER INSERT ON session BEGIN DELETE FROM session; END",
+        "ALTER TABLE session RENAME TO s2; CREATE VIEW session AS SELECT * FROM s2",
+    ],
+)
+def test_a_journal_with_views_or_triggers_is_refused(statements: str, learner: Toy, tmp_path: Path) -> None:
+    committed(tmp_path / "j", learner, 2)
+    with closing(sqlite3.connect(tmp_path / "j")) as connection:
+        connection.executescript(statements)
+    for opened in (Journal.read, lambda path: Journal.open(path, learner)):
+        with pytest.raises(JournalError, match=r"damaged: it has the (view|trigger)"):
+            opened(tmp_path / "j")
+
+
+def test_paths_that_lead_nowhere_and_what_is_no_learner_are_told(learner: Toy, tmp_path: Path) -> None:
+    (tmp_path / "circle").symlink_to(tmp_path / "circle")
+    for path in (tmp_path / "circle", tmp_path / ("x" * 300), "a\0b"):
+        with pytest.raises(JournalError, match="cannot be"):
+            Journal.read(path)
+        with pytest.raises(JournalError, match="cannot be"):
+            Journal.open(path, learner)
+    with pytest.raises(TypeError, match="`learner` must be a learner"):
+        Journal.open(tmp_path / "j", 3)
+    committed(tmp_path / "j", learner, 1)
+    with Journal.read(tmp_path / "j") as view:
+        for last in (0, -1, "3", 10**30):
+            with pytest.raises(ValueError, match="positive number of sessions"):
+                list(view.reports(last))
