@@ -399,7 +399,7 @@ class JournalView:
 
         Raises ``ValueError`` for a file of the journal itself.
         """
-        require_apart("filename", filename, *journal_files(self.path))
+        require_apart("`filename`", filename, *journal_files(self.path))
         self.to_inference_data().to_netcdf(os.fspath(filename), engine="h5netcdf")
 
     def close(self) -> None:
@@ -847,7 +847,7 @@ def require_apart(argument: str, given: str | os.PathLike[str], *others: str | o
     for other in map(Path, others):
         same = other.exists() and wanted.exists() and wanted.samefile(other)
         if same or wanted.resolve() == other.resolve():
-            raise ValueError(f"`{argument}` must be a file of its own; got {wanted}, which is {other}")
+            raise ValueError(f"{argument} must be a file of its own; got {wanted}, which is {other}")
 
 
 def _lacks_log(path: Path) -> bool:
