@@ -310,8 +310,8 @@ BAD = [
 ]
 FEW = LineLimits(size=400, steps=20)
 REASONS = [
-    "not valid JSON", "unknown state 'attic'", "trajectory 0, step 1: ", "more than 400 bytes",
-    "30 steps, more than 20", "trajectory [01], step 2: ",
+    "not valid JSON", "unknown state 'attic'", "trajectory 0, step 1: ", "at most 400 bytes",
+    "at most 20 steps; it has 30", "trajectory [01], step 2: ",
 ]  # fmt: skip
 
 
