@@ -192,7 +192,7 @@ def test_a_bout_that_the_recording_cuts_off_is_read_to_its_last_node():
         ('{"nodes": [0, 127], "frames": [1, NaN]}', r"line 2, frames\[1\]: a frame is a number, got nan"),
         ('{"nodes": [0, 127], "frames": [1, 1e999]}', r"line 2, frames\[1\]: a frame is a number, got inf"),
         (line([0, 127], frames=[1, 2**64]), r"line 2, frames\[1\]: a frame is a number, got 184467440737"),
-        (line([0, *[1, 0] * 5000]), r"line 2: a line must have at most 10000 nodes; it has 10001"),
+        (line([0, *[1, 0] * 5000]), r"line 2: a line must have at most 10,000 nodes; it has 10,001"),
         (line([0, 127], frames=[5, 4]), r"line 2, frames\[1\]: frames go backwards, 5 to 4"),
     ],
 )
