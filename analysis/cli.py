@@ -20,6 +20,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from .results import plain
+
 if TYPE_CHECKING:
     from jax.typing import ArrayLike
     from rich.console import Console
@@ -236,7 +238,7 @@ def bounds(
             features, epsilon, confidence, epsilon_s, discount, deviation, mdp, predicates, steps
         )
     if as_json:
-        print(json.dumps(_plain(bounds_answer.summary(answer))))
+        print(json.dumps(plain(bounds_answer.summary(answer))))
     else:
         bounds_answer.print_answer(answer, _console())
 
@@ -489,7 +491,7 @@ def learn(
 
             def report_session(report: Any) -> None:
                 if as_json:
-                    print(json.dumps(_plain(report._asdict())), flush=True)
+                    print(json.dumps(plain(report._asdict())), flush=True)
                 advance(f"session {report.session}", None)
 
             try:
@@ -546,13 +548,13 @@ def show(
 
 def _print_sessions(view: JournalView, last: int | None) -> None:
     """One JSON object, a session a line, so that a long history is never held whole."""
-    print(f'{{"origin": {json.dumps(_plain(view.origin._asdict()))}, "sessions": [', end="")
+    print(f'{{"origin": {json.dumps(plain(view.origin._asdict()))}, "sessions": [', end="")
     for i, r in enumerate(view.reports(last)):
         fields = {
             "session": r.session,
             "committed": r.committed,
             "weights": r.weights.tolist(),
-            **_plain(r.report),
+            **plain(r.report),
         }
         print(f"{',' if i else ''}\n{json.dumps(fields)}", end="")
     print("\n]}")
@@ -666,17 +668,6 @@ def _say(text: str) -> None:
     from .text import printable
 
     print(printable(text), file=sys.stderr)
-
-
-def _plain(value: Any) -> Any:
-    """Arrays and tuples as JSON takes them; what is no number becomes null."""
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    if isinstance(value, dict):
-        return {k: _plain(v) for k, v in value.items()}
-    if isinstance(value, tuple | list):
-        return [_plain(v) for v in value]
-    return _plain(value.tolist()) if hasattr(value, "tolist") else value
 
 
 def _print_weights(mdp: TabularMDP, state: Any) -> None:
