@@ -244,8 +244,8 @@ def test_command_writes_its_page(tmp_path, monkeypatch, page_faults):
     [
         (["--trajectories", "8,many"], "whole numbers such as 8,16,32, or all, got '8,many'"),
         (["--trajectories", "1"], "2 tasks need at least 2 trajectories"),
-        (["--ways", "0"], "ways must be at least 1"),
-        (["--tasks", "5"], "tasks must be 2"),
+        (["--ways", "0"], "Input should be greater than or equal to 1"),
+        (["--tasks", "5"], "Input should be less than or equal to 3"),
         (["--method", "gail"], "gail"),
         (["--sessions", "99"], "at most the"),
     ],
