@@ -25,33 +25,33 @@ notebooks: $(READY)
 
 # Trains the experts of the continuous tasks anew, and records them in domains/recordings.
 experts: $(READY)
-	$(BIN)/python -m i2rl.domains.experts
+	$(BIN)/python -m i2rl.domains.robots.experts
 
 bench: $(READY)
-	$(BIN)/python -m i2rl.analysis.benchmarks.sessions
-	$(BIN)/python -m i2rl.analysis.benchmarks.accuracy
-	$(BIN)/python -m i2rl.analysis.benchmarks.planning
-	$(BIN)/python -m i2rl.analysis.benchmarks.posterior
-	$(BIN)/python -m i2rl.analysis.benchmarks.calibration
-	$(BIN)/python -m i2rl.analysis.benchmarks.ways
-	$(BIN)/python -m i2rl.analysis.benchmarks.mixture
-	$(BIN)/python -m i2rl.analysis.benchmarks.coverage
-	$(BIN)/python -m i2rl.analysis.benchmarks.regret
-	$(BIN)/python -m i2rl.analysis.benchmarks.stopping
-	$(BIN)/python -m i2rl.analysis.benchmarks.selection
-	$(BIN)/python -m i2rl.analysis.benchmarks.kills
-	$(BIN)/python -m i2rl.analysis.benchmarks.journals
-	$(BIN)/python -m i2rl.analysis.benchmarks.fuzz
-	$(BIN)/python -m i2rl.analysis.benchmarks.units
-	$(BIN)/python -m i2rl.analysis.benchmarks.gibbs
-	$(BIN)/python -m i2rl.analysis.benchmarks.noisy_cost
-	$(BIN)/python -m i2rl.analysis.benchmarks.adversarial_cost
-	$(BIN)/python -m i2rl.analysis.benchmarks.adversarial_patrol
+	$(BIN)/python -m i2rl.analysis.benchmarks.cost.sessions
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.accuracy
+	$(BIN)/python -m i2rl.analysis.benchmarks.cost.planning
+	$(BIN)/python -m i2rl.analysis.benchmarks.cost.posterior
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.calibration
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.ways
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.mixture
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.coverage
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.regret
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.stopping
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.selection
+	$(BIN)/python -m i2rl.analysis.benchmarks.faults.kills
+	$(BIN)/python -m i2rl.analysis.benchmarks.faults.journals
+	$(BIN)/python -m i2rl.analysis.benchmarks.faults.fuzz
+	$(BIN)/python -m i2rl.analysis.benchmarks.faults.units
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.gibbs
+	$(BIN)/python -m i2rl.analysis.benchmarks.cost.noisy
+	$(BIN)/python -m i2rl.analysis.benchmarks.cost.adversarial
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.adversarial_patrol
 
 bench-peers: $(READY) $(PEERS)/.installed
-	$(BIN)/python -m i2rl.analysis.benchmarks.peers --peer-python $(PEERS)/bin/python
-	$(BIN)/python -m i2rl.analysis.benchmarks.ppo_peer --peer-python $(PEERS)/bin/python
-	$(BIN)/python -m i2rl.analysis.benchmarks.airl_peers --peer-python $(PEERS)/bin/python
+	$(BIN)/python -m i2rl.analysis.benchmarks.peers.finite_horizon --peer-python $(PEERS)/bin/python
+	$(BIN)/python -m i2rl.analysis.benchmarks.peers.ppo --peer-python $(PEERS)/bin/python
+	$(BIN)/python -m i2rl.analysis.benchmarks.peers.airl --peer-python $(PEERS)/bin/python
 
 $(READY): requirements.lock pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "i2rl needs Python 3.11 or later: make PYTHON=python3.11 ...")'

@@ -4,9 +4,9 @@ import importlib
 from typing import Any
 
 _HOMES = {
-    "assumptions": ("Assumption", "Bound", "BoundNotGuaranteed", "check"),
-    "bound_figures": ("looseness_plot", "sample_size_plot"),
-    "bounds": (
+    "bounds.assumptions": ("Assumption", "Bound", "BoundNotGuaranteed", "check"),
+    "bounds.figures": ("looseness_plot", "sample_size_plot"),
+    "bounds.theorems": (
         "Monotonicity",
         "ObservedBound",
         "Regret",
@@ -27,9 +27,14 @@ _HOMES = {
         "table_7_1a",
         "table_7_1b",
     ),
-    "concentration": ("confidence_sequence", "empirical_bernstein", "hoeffding", "predictable_bernstein"),
-    "coverage": ("Coverage", "Setting", "coverage_table", "full_view_coverage", "ignorance_gap"),
-    "diagnostic_figures": (
+    "bounds.concentration": (
+        "confidence_sequence",
+        "empirical_bernstein",
+        "hoeffding",
+        "predictable_bernstein",
+    ),
+    "bounds.coverage": ("Coverage", "Setting", "coverage_table", "full_view_coverage", "ignorance_gap"),
+    "posteriors.figures": (
         "completed_path",
         "completion_frequencies",
         "convergence_plot",
@@ -39,8 +44,8 @@ _HOMES = {
         "trace_plot",
         "weights_by_session",
     ),
-    "diagnostics": ("InferenceDataError", "posterior_by_session", "require_posterior", "summary"),
-    "figures": (
+    "posteriors.diagnostics": ("InferenceDataError", "posterior_by_session", "require_posterior", "summary"),
+    "drawing.charts": (
         "LearningCurve",
         "LearningTime",
         "SuccessRate",
@@ -49,20 +54,20 @@ _HOMES = {
         "success_rates",
         "weights_plot",
     ),
-    "estimates": ("Estimates",),
-    "history": ("fleet_history", "run_history"),
-    "identifiability": (
+    "drawing.estimates": ("Estimates",),
+    "posteriors.history": ("fleet_history", "run_history"),
+    "posteriors.identifiability": (
         "Identifiability",
         "describe_identifiability",
         "directions_table",
         "identifiability_of",
         "identifiability_section",
     ),
-    "information": ("complete_information", "expected_information", "observed_information"),
-    "invariance": ("Direction", "unidentified_directions"),
-    "label_bias": ("Correlation", "LabelBiasStudy", "correlation"),
-    "maps": ("hidden_path", "policy_map"),
-    "metrics": (
+    "posteriors.information": ("complete_information", "expected_information", "observed_information"),
+    "posteriors.invariance": ("Direction", "unidentified_directions"),
+    "studies.label_bias.study": ("Correlation", "LabelBiasStudy", "correlation"),
+    "drawing.maps": ("hidden_path", "policy_map"),
+    "judging.metrics": (
         "Accuracy",
         "Evaluation",
         "LearningError",
@@ -78,14 +83,14 @@ _HOMES = {
         "policy_error",
         "quantile_band",
     ),
-    "multi_task_metrics": (
+    "judging.multi_task": (
         "adjusted_rand_index",
         "assignment_accuracy",
         "expected_value_difference",
         "match_ways",
     ),
-    "online_methods": ("methods_table", "turning_places"),
-    "perception_bounds": (
+    "studies.methods.study": ("methods_table", "turning_places"),
+    "bounds.perception": (
         "noisy_confidence",
         "noisy_constraint_bound",
         "perception_needed",
@@ -95,16 +100,16 @@ _HOMES = {
         "rimeo_no_regret_sizes",
         "same_reports_constraint_bound",
     ),
-    "noise_coverage": ("learned_perception_coverage", "perception_coverage", "posterior_change"),
-    "perception_distance": (
+    "bounds.noise_coverage": ("learned_perception_coverage", "perception_coverage", "posterior_change"),
+    "bounds.distance": (
         "ModelDistance",
         "Perception",
         "model_distance",
         "posterior_distance",
         "report_distance",
     ),
-    "predictive": ("predictive_check", "predictive_visits"),
-    "regret": (
+    "posteriors.predictive": ("predictive_check", "predictive_visits"),
+    "bounds.regret": (
         "BoundCurve",
         "Gaps",
         "RegretCurve",
@@ -116,16 +121,16 @@ _HOMES = {
         "regret_plot",
         "sure_bound",
     ),
-    "page": ("Lead", "Picture", "Section", "Table", "write_page"),
-    "results": ("study_provenance",),
-    "selection": (
+    "drawing.page": ("Lead", "Picture", "Section", "Table", "write_page"),
+    "drawing.results": ("study_provenance",),
+    "posteriors.selection": (
         "FeatureComparison",
         "compare_features",
         "compare_posteriors",
         "select_features",
         "with_features",
     ),
-    "sorting_table": (
+    "studies.sorting.table": (
         "SortingRow",
         "SortingTable",
         "print_sorting_table",
@@ -133,9 +138,9 @@ _HOMES = {
         "sorting_table_summary",
         "table_7_2",
     ),
-    "stopping": ("Sweep", "Verdict", "judge_stops", "stopping_plot", "sweep_tolerance"),
-    "stream": ("learn_stream",),
-    "style": ("DARK", "LIGHT", "Theme", "save", "save_themes"),
+    "bounds.stopping": ("Sweep", "Verdict", "judge_stops", "stopping_plot", "sweep_tolerance"),
+    "command.stream": ("learn_stream",),
+    "drawing.style": ("DARK", "LIGHT", "Theme", "save", "save_themes"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME_OF)

@@ -7,11 +7,10 @@ are imported when they are first used: they need the extra ``adversarial``.
 import importlib
 from typing import Any
 
-from .breach_environment import BreachEnv
-from .breach_trials import BreachOutcome, breach_trials, greedy_policies, random_policies, soft_policies
 from .environments import TabularEnv
-from .labyrinth import Bout, Labyrinth, labyrinth, read_bouts, simulate_bouts
-from .noisy_perception import (
+from .labyrinth.process import Bout, Labyrinth, labyrinth, read_bouts, simulate_bouts
+from .noisy.swap_noise import SwapNoise
+from .noisy.tasks import (
     NoisyDemonstration,
     NoisyTask,
     agreement_probabilities,
@@ -19,8 +18,9 @@ from .noisy_perception import (
     noisy_patrol,
     noisy_sorting,
 )
-from .object_world import ObjectWorld, object_world, walled_world, without_blocked_moves
-from .patrol import (
+from .object_world.process import ObjectWorld, object_world, walled_world, without_blocked_moves
+from .patrol.environment import BreachEnv
+from .patrol.process import (
     Interaction,
     Patrol,
     boyd_fifth_floor,
@@ -30,7 +30,9 @@ from .patrol import (
     instance,
     simulate_patrol,
 )
-from .sorting import (
+from .patrol.trials import BreachOutcome, breach_trials, greedy_policies, random_policies, soft_policies
+from .sorting.line import Line, Tally, sort_belts
+from .sorting.process import (
     MixedDemonstration,
     Sorting,
     demonstrate_sorting,
@@ -38,13 +40,11 @@ from .sorting import (
     sorting_with_claiming,
     sorting_without_claiming,
 )
-from .sorting_line import Line, Tally, sort_belts
-from .swap_noise import SwapNoise
 
 _HOMES = {
-    "control": ("cart_pole", "mountain_car"),
-    "experts": ("load_demonstrations", "load_expert"),
-    "onion_recordings": ("read_onion_recordings", "write_onion_recordings"),
+    "robots.control": ("cart_pole", "mountain_car"),
+    "robots.experts": ("load_demonstrations", "load_expert"),
+    "robots.onion_recordings": ("read_onion_recordings", "write_onion_recordings"),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 __all__ = [

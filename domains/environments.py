@@ -31,16 +31,16 @@ import numpy as np
 from gymnasium.spaces import Discrete
 from jaxtyping import UInt8
 
-from ..models.mdp import TabularMDP
-from ..models.text import listed, shortened
-from .labyrinth import WATER_PORT, labyrinth
-from .object_world import object_world
-from .patrol import instance
-from .sorting import Sorting, pick_inspect_place, sorting_with_claiming, sorting_without_claiming
+from ..models.inputs.text import listed, shortened
+from ..models.process.mdp import TabularMDP
+from .labyrinth.process import WATER_PORT, labyrinth
+from .object_world.process import object_world
+from .patrol.process import instance
+from .sorting.process import Sorting, pick_inspect_place, sorting_with_claiming, sorting_without_claiming
 
 if TYPE_CHECKING:
-    from .breach_environment import BreachEnv
-    from .pictures import Scene
+    from .gym.pictures import Scene
+    from .patrol.environment import BreachEnv
 
 
 class TabularEnv(gymnasium.Env[int, int]):
@@ -168,7 +168,7 @@ class TabularEnv(gymnasium.Env[int, int]):
             return None
         if self._state is None:
             raise gymnasium.error.ResetNeeded("reset the environment before rendering it")
-        from .pictures import Frame, caption, text_scene
+        from .gym.pictures import Frame, caption, text_scene
 
         shown = Frame(self._state, *(self._last or ()))
         if self.render_mode == "ansi":
@@ -191,7 +191,7 @@ def patrol_environment(number: int = 2, weights: Sequence[float] | None = None, 
     patrol = instance(number)
 
     def scene() -> Scene:
-        from .pictures import patrol_scene
+        from .gym.pictures import patrol_scene
 
         return patrol_scene(patrol)
 
@@ -204,7 +204,7 @@ def labyrinth_environment(weights: Sequence[float] | None = None, **options: Any
     thirst = np.array([name == f"reaches {WATER_PORT}" for name in maze.mdp.feature_names], float)
 
     def scene() -> Scene:
-        from .pictures import labyrinth_scene
+        from .gym.pictures import labyrinth_scene
 
         return labyrinth_scene(maze)
 
@@ -237,7 +237,7 @@ def sorting_environment(
     reward = _weights_of(sorting, behaviour) if weights is None else weights
 
     def scene() -> Scene:
-        from .sorting_picture import sorting_scene
+        from .sorting.picture import sorting_scene
 
         return sorting_scene(sorting)
 
@@ -263,7 +263,7 @@ def object_world_environment(
     world = object_world(jax.random.key(layout), size, walls, slip=slip)
 
     def scene() -> Scene:
-        from .pictures import object_world_scene
+        from .gym.pictures import object_world_scene
 
         return object_world_scene(world)
 
@@ -272,7 +272,7 @@ def object_world_environment(
 
 def breach_environment(number: int = 2, **options: Any) -> BreachEnv:
     """The breach of an instance; other options as :class:`BreachEnv`."""
-    from .breach_environment import BreachEnv
+    from .patrol.environment import BreachEnv
 
     return BreachEnv(instance(number), **options)
 

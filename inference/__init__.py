@@ -9,7 +9,7 @@ from typing import Any
 from .. import precision  # noqa: F401
 
 _HOMES = {
-    "adversarial_learner": (
+    "adversarial.learner": (
         "AdversarialReport",
         "AdversarialState",
         "AdversarialTraining",
@@ -17,7 +17,7 @@ _HOMES = {
         "airl",
         "gail",
     ),
-    "adversarial_tabular": (
+    "adversarial.tabular.learners": (
         "airl_tabular",
         "gail_tabular",
         "gibbs_airl_tabular",
@@ -25,30 +25,37 @@ _HOMES = {
         "robust_airl_with_learned_sensor",
         "robust_gail_tabular",
     ),
-    "boltzmann": (
+    "learners.boltzmann": (
         "boltzmann_log_likelihoods",
         "boltzmann_log_policy",
         "optimal_action_values",
         "visit_counts",
     ),
-    "clustering": ("Clustering",),
-    "darko": ("darko_i2rl", "ending_at", "feature_margin", "goal_sessions", "stopping_places", "with_end"),
-    "discriminator": (
+    "mixtures.clustering": ("Clustering",),
+    "learners.darko": (
+        "darko_i2rl",
+        "ending_at",
+        "feature_margin",
+        "goal_sessions",
+        "stopping_places",
+        "with_end",
+    ),
+    "adversarial.discriminator": (
         "Discriminator",
         "ExpertTransitions",
         "Transitions",
         "airl_discriminator",
         "gail_discriminator",
     ),
-    "dpm": ("DPMBIRL", "DPMTrace", "dpm_birl"),
-    "entropic": ("entropic_proportions",),
-    "gaussian_gibbs": ("GaussianGibbs",),
-    "gaussian_truth": (
+    "learners.dpm": ("DPMBIRL", "DPMTrace", "dpm_birl"),
+    "programs.entropic": ("entropic_proportions",),
+    "completion.gibbs": ("GaussianGibbs",),
+    "completion.gaussian": (
         "GaussianTruth",
         "fitted_sensor",
         "jax_dynamics",
     ),
-    "hidden_truth": (
+    "adversarial.robust": (
         "Smoothed",
         "SmoothedAndFitted",
         "fit_gaussian",
@@ -57,15 +64,15 @@ _HOMES = {
         "robust_airl",
         "robust_airl_with_sensor",
     ),
-    "identification": ("SensorIdentification", "sensor_identification", "sensor_identifier"),
-    "jin": ("jin_i2rl", "jin_i2rl_with_features", "reward_correction", "with_state_features"),
-    "journal": ("Journal", "JournalBusy", "JournalError", "JournalView", "Position", "SessionRecord"),
-    "kalman": (
+    "learners.identification": ("SensorIdentification", "sensor_identification", "sensor_identifier"),
+    "learners.jin": ("jin_i2rl", "jin_i2rl_with_features", "reward_correction", "with_state_features"),
+    "journal.journal": ("Journal", "JournalBusy", "JournalError", "JournalView", "Position", "SessionRecord"),
+    "completion.kalman": (
         "AffineGaussian",
         "filter_gaussian",
         "smooth_gaussian",
     ),
-    "lme": (
+    "learners.lme": (
         "Batch",
         "BatchFit",
         "LMEState",
@@ -74,12 +81,18 @@ _HOMES = {
         "lme_i2rl_with_random_weights",
         "me_i2rl",
     ),
-    "maxent": ("Solution", "WarmStart", "exponentiated_gradient", "fit_counts", "solve_dual"),
-    "maxent_constraints": ("FeatureTarget", "InfeasibleProgram", "ProgramNotSolved"),
-    "maxent_dual": ("CountProgram", "DualProgram"),
-    "maxent_primal": ("PrimalProgram",),
-    "maximum_likelihood": ("EMMLIRL", "EMTrace", "MLIRLFit", "em_mlirl", "mlirl"),
-    "mce": (
+    "programs.maximum_entropy": (
+        "Solution",
+        "WarmStart",
+        "exponentiated_gradient",
+        "fit_counts",
+        "solve_dual",
+    ),
+    "programs.constraints": ("FeatureTarget", "InfeasibleProgram", "ProgramNotSolved"),
+    "programs.dual": ("CountProgram", "DualProgram"),
+    "programs.primal": ("PrimalProgram",),
+    "learners.maximum_likelihood": ("EMMLIRL", "EMTrace", "MLIRLFit", "em_mlirl", "mlirl"),
+    "programs.finite_horizon": (
         "CausalEntropyFit",
         "UnmatchedError",
         "expected_features",
@@ -88,7 +101,7 @@ _HOMES = {
         "fit_state_rewards",
         "fit_weights",
     ),
-    "mtirl": (
+    "learners.mtirl": (
         "BatchMixture",
         "MixtureReport",
         "MixtureState",
@@ -97,38 +110,38 @@ _HOMES = {
         "clustering_of",
         "mme_mtirl",
     ),
-    "noisy_posterior": ("sample_noisy_posterior",),
-    "observation_program": (
+    "posteriors.noisy": ("sample_noisy_posterior",),
+    "programs.observation": (
         "Identification",
         "ObservationProgram",
         "ObservationSolution",
         "unidentified_predicates",
     ),
-    "observation_printed": ("solve_printed_program",),
-    "partition_truth": (
+    "programs.printed.observation": ("solve_printed_program",),
+    "completion.partitioned": (
         "CandidateTruth",
         "PartitionTruth",
         "candidate_truth",
         "fitted_shift_sensor",
     ),
-    "perception": ("WithTruth",),
-    "policy_walk": ("birl",),
-    "ppo": ("PPO", "PPOState"),
-    "minmax": ("MinMaxProgram", "MinMaxSolution"),
-    "minmax_printed": (
+    "sensors.reliabilities": ("WithTruth",),
+    "posteriors.policy_walk": ("birl",),
+    "adversarial.policy_optimisation": ("PPO", "PPOState"),
+    "programs.minmax": ("MinMaxProgram", "MinMaxSolution"),
+    "programs.printed.minmax": (
         "TrajectorySpace",
         "ascend_printed",
         "coded_assignment_gradient",
         "printed_assignment_gradient",
     ),
-    "mixture_gibbs": ("gibbs_mixture_posterior",),
-    "mixture_posterior": ("sample_mixture_posterior",),
-    "mixture_problem": ("label_invariant",),
-    "posterior": ("sample_posterior",),
-    "robust": ("RIMEOReport", "RIMEOState", "rifom", "rimeo", "robust_irl"),
-    "rollouts": ("Episodes", "finished_returns", "play"),
-    "schedule": ("Harmonic",),
-    "session": (
+    "posteriors.gibbs": ("gibbs_mixture_posterior",),
+    "posteriors.mixture": ("sample_mixture_posterior",),
+    "posteriors.mixture_problem": ("label_invariant",),
+    "posteriors.weights": ("sample_posterior",),
+    "learners.noisy": ("RIMEOReport", "RIMEOState", "rifom", "rimeo", "robust_irl"),
+    "adversarial.rollouts": ("Episodes", "finished_returns", "play"),
+    "sessions.schedule": ("Harmonic",),
+    "sessions.session": (
         "Fleet",
         "Learner",
         "LearningErrorChange",
@@ -143,7 +156,7 @@ _HOMES = {
         "run_sessions",
         "run_streams",
     ),
-    "smoothing": (
+    "completion.smoothing": (
         "Evidence",
         "Expectations",
         "blocked_expectations",
@@ -154,17 +167,17 @@ _HOMES = {
         "sample_completions",
         "smooth_all",
     ),
-    "snippet_regression": (
+    "adversarial.snippets": (
         "Regression",
         "SSRRReward",
     ),
-    "statistic": ("CountStatistic", "FeatureStatistic"),
-    "tabular_training": (
+    "sessions.statistic": ("CountStatistic", "FeatureStatistic"),
+    "adversarial.tabular.training": (
         "TabularAdversarialReport",
         "TabularAdversarialState",
         "TabularTraining",
     ),
-    "truth_sampling": ("FaceValue",),
+    "adversarial.truth": ("FaceValue",),
 }
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 __all__ = sorted(_HOME_OF)

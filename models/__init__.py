@@ -5,9 +5,12 @@ programs need the digits.
 """
 
 from .. import precision  # noqa: F401  (before anything computes)
-from .archives import StorageError
-from .confusions import Confusions
-from .demonstration import (
+from .inputs.archives import StorageError
+from .laws.mixture import MixtureLaw, mixture_model, stick_proportions, truncation_error
+from .laws.occlusion import occlusion_model, weights_prior
+from .laws.trajectory import TrajectoryLaw, sample_demonstration
+from .observation.confusions import Confusions
+from .observation.demonstration import (
     Demonstration,
     DemonstrationError,
     LineLimits,
@@ -16,7 +19,7 @@ from .demonstration import (
     read_trajectories,
     write_trajectories,
 )
-from .evidence import (
+from .observation.evidence import (
     FeatureNoise,
     Imperfection,
     ObservationModel,
@@ -25,10 +28,10 @@ from .evidence import (
     log_evidence,
     require_possible,
 )
-from .mdp import TabularMDP
-from .mixture import MixtureLaw, mixture_model, stick_proportions, truncation_error
-from .occlusion import occlusion_model, weights_prior
-from .planning import (
+from .observation.recordings import GaussianSensor, Recording, RecordingError, ShiftSensor, distort, recording
+from .observation.storage import load_mdp, save_mdp
+from .process.mdp import TabularMDP
+from .process.planning import (
     FinitePlan,
     HardPlan,
     SoftPlan,
@@ -47,10 +50,7 @@ from .planning import (
     simulate,
     soft_plan,
 )
-from .sensing import GaussianSensor, Recording, RecordingError, ShiftSensor, distort, recording
-from .storage import load_mdp, save_mdp
-from .trajectory import TrajectoryLaw, sample_demonstration
-from .units import feature_scale, with_scaled_features
+from .process.units import feature_scale, with_scaled_features
 
 __all__ = [
     "Confusions",

@@ -14,11 +14,11 @@ import numpy as np
 import pytest
 from hypothesis import settings
 
-from i2rl.analysis.page import GLOSSARY
+from i2rl.analysis.drawing.page import GLOSSARY
 from i2rl.models import Demonstration, TabularMDP
-from i2rl.models.demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN
-from i2rl.models.evidence import observe
-from i2rl.models.planning import simulate
+from i2rl.models.observation.demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN
+from i2rl.models.observation.evidence import observe
+from i2rl.models.process.planning import simulate
 
 settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=25, database=None)
 settings.load_profile("deterministic")
@@ -40,7 +40,7 @@ def _compiled_programs_are_let_go():
 @pytest.fixture
 def small_pictures(monkeypatch):
     """Pages with pictures of few dots: what is on them is tested on figures themselves."""
-    monkeypatch.setattr("i2rl.analysis.style.DPI", 30)
+    monkeypatch.setattr("i2rl.analysis.drawing.style.DPI", 30)
 
 
 @pytest.fixture(scope="session")

@@ -76,7 +76,7 @@ def test_a_name_alone_computes_in_64_bits():
     script = """
 import jax.numpy as jnp
 from i2rl.inference import smooth_gaussian
-from i2rl.inference.kalman import AffineGaussian
+from i2rl.inference.completion.kalman import AffineGaussian
 assert smooth_gaussian and AffineGaussian and jnp.ones(1).dtype == jnp.float64
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120)

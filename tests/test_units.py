@@ -11,7 +11,7 @@ import numpy as np
 import numpyro.distributions as dist
 import pytest
 
-from i2rl.analysis.benchmarks.units import (
+from i2rl.analysis.benchmarks.faults.units import (
     KEY,
     METHODS,
     PREDICATES,
@@ -29,20 +29,23 @@ from i2rl.analysis.benchmarks.units import (
     target,
     units_of,
 )
-from i2rl.inference import fleet, lme_i2rl, me_i2rl, mixture_problem, noisy_posterior, posterior, solve_dual
-from i2rl.inference.jin import jin_i2rl_with_features
-from i2rl.inference.maxent import require_converged
-from i2rl.inference.maxent_constraints import (
+from i2rl.inference import fleet, lme_i2rl, me_i2rl, solve_dual
+from i2rl.inference.learners.jin import jin_i2rl_with_features
+from i2rl.inference.posteriors import mixture_problem
+from i2rl.inference.posteriors import noisy as noisy_posterior
+from i2rl.inference.posteriors import weights as posterior
+from i2rl.inference.programs.constraints import (
     FeatureTarget,
     InfeasibleProgram,
     ProgramNotSolved,
     excluded_pairs,
 )
-from i2rl.inference.maxent_dual import DualProgram
-from i2rl.inference.maxent_primal import PrimalProgram
+from i2rl.inference.programs.dual import DualProgram
+from i2rl.inference.programs.maximum_entropy import require_converged
+from i2rl.inference.programs.primal import PrimalProgram
 from i2rl.models import Demonstration, Sensor, TabularMDP, feature_expectations
-from i2rl.models.occlusion import ScaledPrior, scaled_prior
-from i2rl.models.units import feature_scale, with_scaled_features
+from i2rl.models.laws.occlusion import ScaledPrior, scaled_prior
+from i2rl.models.process.units import feature_scale, with_scaled_features
 
 # All small, all large, mixed, mixed otherwise, and such as people use.
 UNITS = [

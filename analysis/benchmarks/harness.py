@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..text import number
+from ..drawing.text import number
 
 DEFAULT_FOLDER = Path("build/bench")
 
@@ -48,7 +48,7 @@ def print_table(title: str, columns: Sequence[str], rows: Sequence[Sequence[Any]
     """Print rows as a table; numbers to four significant digits."""
     from rich.console import Console
 
-    from ..page import Table, print_tables
+    from ..drawing.page import Table, print_tables
 
     cells = [[number(x, 4) if isinstance(x, float) else str(x) for x in row] for row in rows]
     print_tables([Table(columns, cells)], Console(width=140), title)

@@ -1,0 +1,4 @@
+"""Benchmarks of statistical behaviour: calibration, coverage, accuracy.
+
+Imports every room but the command line's.
+"""

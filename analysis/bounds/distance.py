@@ -1,0 +1,131 @@
+"""How far reports, and posteriors over what was done, can be apart if an observation model is not exact.
+
+``p_j`` are the reliabilities of ``|Psi|`` predicates (Eq. 6.5), known within ``epsilon_o``. Distances are
+total variations, by which the expectation of a value in [0, 1] can change.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from ...models.observation.evidence import Imperfection
+from .theorems import _counted, _positive
+
+
+class Perception(NamedTuple):
+    """What the bounds ask about perception.
+
+    ``samples`` used to estimate the observation model (``n_o``), its error ``epsilon_o``, the number of
+    ``predicates`` (``|Psi|``), and the ``longest`` trajectory's steps (``L``).
+    """
+
+    samples: float
+    epsilon_o: float
+    predicates: int
+    longest: int
+
+
+def report_distance(perception: Perception, reliabilities: Float[np.ndarray, " J"] | None = None) -> float:
+    """How far the reports of one and the same trajectory can be apart under true and estimated reliabilities.
+
+    Total variation, at most ``1 - (1 - epsilon_o)^(L |Psi|) <= L |Psi| epsilon_o`` (reports can be coupled so
+    that each predicate of each step differs with probability ``epsilon_o``). With the estimated
+    ``reliabilities [J]`` also at most ``sqrt(1 - rho^2)``, ``rho`` the Bhattacharyya coefficient, which grows
+    with the root of ``L |Psi|`` only; the smaller is returned. Predicates are reported independently. Raises
+    ``ValueError`` for an error that is not positive, or reliabilities that are not ``|Psi|`` probabilities.
+    """
+    coupled = _over_steps(_error(perception), perception.longest * perception.predicates)
+    if reliabilities is None:
+        return coupled
+    p, ends = _intervals(perception, reliabilities)
+    # Concave in the true reliability, so that an end of its interval is worst.
+    overlap = (np.sqrt(p * ends) + np.sqrt((1 - p) * (1 - ends))).min(axis=0)
+    rho = np.exp(perception.longest * np.log(np.minimum(overlap, 1)).sum())
+    return float(min(coupled, np.sqrt(-np.expm1(2 * np.log(rho))) if rho > 0 else 1.0))
+
+
+def posterior_distance(perception: Perception, reliabilities: Float[np.ndarray, " J"]) -> float:
+    """How far posteriors over trajectories can be apart under true and estimated reliabilities, surely.
+
+    Total variation, at most ``tanh(L / 4 sum_j |logit p_j - logit p_hat_j|)``, whatever was reported,
+    whatever the weights, and however the estimate came about: likelihood ratios of two trajectories change by
+    at most the exponential of ``L`` times that sum. One where a reliability may be 0 or 1. Errors as
+    :func:`report_distance`.
+    """
+    p, ends = _intervals(perception, reliabilities)
+    if not ((ends > 0) & (ends < 1)).all():
+        return 1.0
+    change = np.abs(np.log(ends) - np.log1p(-ends) - np.log(p) + np.log1p(-p)).max(axis=0)
+    return float(np.tanh(perception.longest * change.sum() / 4))
+
+
+class ModelDistance(NamedTuple):
+    """How far two observation models are apart, at one step.
+
+    Fields
+    ------
+    variation : float
+        Total variation between the reports of a truth, at the worst truth. ``1 - (1 - variation)^L`` takes
+        the place of :func:`report_distance`.
+    odds : float
+        By how much the logarithm of a likelihood ratio of two truths changes, at the worst report. ``tanh(L
+        odds / 4)`` takes the place of :func:`posterior_distance`.
+    """
+
+    variation: float
+    odds: float
+
+    def over(self, steps: int) -> tuple[float, float]:
+        """Bounds of the total variation of a trajectory's reports, and of the posterior over trajectories."""
+        _counted("steps", steps)
+        return _over_steps(self.variation, steps), math.tanh(steps * self.odds / 4)
+
+
+def model_distance(
+    one: Imperfection, other: Imperfection, truths: Bool[np.ndarray, "S A"] | None = None
+) -> ModelDistance:
+    """Compare two observation models of any kind, at the ``truths`` that can occur (all by default).
+
+    Raises ``ValueError`` for imperfections without an observation model, or about different pairs.
+    """
+    if one.reading is None or other.reading is None:
+        raise ValueError("an imperfection without an observation model reports exactly: nothing to compare")
+    tables = [np.asarray(x.reading.log_probabilities) for x in (one, other)]  # type: ignore[union-attr]
+    if tables[0].shape != tables[1].shape:
+        raise ValueError(f"the models are about pairs {tables[0].shape[:2]} and {tables[1].shape[:2]}")
+    mask = np.ones(tables[0].shape[:2], bool) if truths is None else np.asarray(truths, bool)
+    if mask.shape != tables[0].shape[:2] or not mask.any():
+        raise ValueError(f"truths mark some of the pairs {tables[0].shape[:2]}, got shape {mask.shape}")
+    log_p, log_q = (x.reshape(mask.size, mask.size)[mask.ravel()] for x in tables)
+    variation = float(np.abs(np.exp(log_p) - np.exp(log_q)).sum(axis=1).max() / 2)
+    possible = np.isfinite(log_p) | np.isfinite(log_q)
+    with np.errstate(invalid="ignore"):
+        ratio = log_p - log_q
+    odds = np.where(possible, ratio, -np.inf).max(0) - np.where(possible, ratio, np.inf).min(0)
+    return ModelDistance(min(1.0, variation), float(odds[possible.any(0)].max()))
+
+
+def _over_steps(variation: float, steps: int) -> float:
+    return -math.expm1(steps * math.log1p(-variation)) if variation < 1 else 1.0
+
+
+# -- border -------------------------------------------------------------------------------------------
+
+
+def _error(perception: Perception) -> float:
+    _counted("predicates", perception.predicates), _counted("longest", perception.longest)
+    return _positive("epsilon_o", perception.epsilon_o)
+
+
+def _intervals(
+    perception: Perception, reliabilities: Float[np.ndarray, " J"]
+) -> tuple[Float[np.ndarray, " J"], Float[np.ndarray, "2 J"]]:
+    """The estimates, and the ends of what each true reliability may be."""
+    error, p = _error(perception), np.asarray(reliabilities, float)
+    if p.shape != (perception.predicates,) or not ((p >= 0) & (p <= 1)).all():
+        raise ValueError(f"reliabilities are {perception.predicates} probabilities, got {reliabilities}")
+    return p, np.clip([p - error, p + error], 0, 1)

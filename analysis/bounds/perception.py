@@ -1,0 +1,313 @@
+"""Bounds under noisy perception whose observation model is estimated (chapter 6.1, appendix E): RIMEO's.
+
+Printed and corrected statements stand side by side; notation is that of
+:mod:`~i2rl.analysis.bounds.theorems`. ``p_j`` are the reliabilities of the ``|Psi|`` predicates, ``O(o | g)``
+the observation model that they make (Eq. 6.5), ``L`` the steps of the longest trajectory, ``n_o`` the reports
+that the model was estimated from.
+
+What Lemma 4 (Lemma 8 of appendix E) says, read closely. Its term ``L |Psi| epsilon_o`` can be proved, though
+not as printed, and of something else than what is printed:
+
+- ``epsilon_o`` is said to bound ``|O - O_hat|`` at the pairs that were observed, and the error at every other
+  pair is said to be ``|Psi|`` times that. Products that agree say nothing of their factors: reliabilities
+  (0.9, 0.1) and (0.1, 0.9) give a report with both predicates right the same 0.09, and one with only the
+  first right 0.81 or 0.01. If ``epsilon_o`` bounds the error of each *reliability*, then reports of one truth
+  differ by at most ``|Psi| epsilon_o`` in total variation, and ``L |Psi| epsilon_o`` over a trajectory.
+- Hoeffding's inequality is about a mean of values whose expectation is what is estimated. Matches counted
+  where the truth is known are such; a running average of scores (Eq. 6.6) is not, and without truths or
+  scores the reliabilities need not be identified at all.
+- The posterior's normaliser ``eta`` belongs to a model; the proof gives both models the same one, and then
+  drops it from ``sum_xi f_k(xi) eta P(xi) <= 1 / (1 - gamma)``, although it is the inverse probability of the
+  report and as large as the report is rare. For the trajectories that were seen, the term is therefore no
+  bound: one predicate, one step, a truth of probability 0.01, reliabilities 0.99 and 0.995, and the report
+  that it holds moves the posterior by 0.17 instead of 0.005. *In expectation over reports* it is a bound.
+  With ``P`` and ``P_hat`` the laws of reports under the two models and the expert's behaviour, ``E_P[phi_hat]
+  - E[phi] = sum_o (P(o) - P_hat(o)) phi_hat(o)``, because ``E_P_hat[phi_hat] = E[phi]``: at most the total
+  variation of the two laws, which is at most that of the reports of one truth.
+- That needs the expert's weights in the posterior, and a model that does not depend on the reports it is used
+  on. Without the latter, or for the posterior's change itself, only odds help: :func:`.posterior_distance`.
+- RIMEO's posterior is under its own weights, and then no bound of this form holds. The printed one does not
+  depend on how noisy perception is. At reliabilities of 1/2, known exactly, the posterior is the prior, all
+  weights reproduce themselves, and the program with slack returns zero: what is lost is what knowing nothing
+  loses, however many trajectories there are. The study of coverage has it happen at 0.6 too.
+- ``delta_o`` counts every feature ``k``, although one event (all reliabilities are within ``epsilon_o``)
+  makes the term hold for all of them: ``2 |Psi| exp(-2 n_o epsilon_o^2)`` is enough. ``epsilon_s`` and
+  ``delta_s`` are needless as they are in Lemma 2: the posterior's expected features, or those of any number
+  of completions drawn from it, are independent values in [0, 1] themselves.
+- Discounting does not shorten ``L``: a report of a late step is evidence about early ones. The features'
+  discounted sum has the range ``1 / (1 - gamma)`` however late the error is.
+- Eq. 6.5 is a distribution over reports only if every combination of predicates can be reported. Normalised
+  over those that can, a reliability is a parameter and ``|Psi| epsilon_o`` no bound; :func:`.model_distance`
+  measures what takes the place of ``epsilon_o |Psi|``.
+- The features of earlier sessions are not completed again when the model improves (Eq. 6.9): ``n_o`` is what
+  the model of the *first* session was estimated from, or ``epsilon_o`` an average over sessions.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+import pandas as pd
+from jaxtyping import Float, Int
+
+from ...inference.sessions.schedule import Harmonic, described
+from .assumptions import (
+    COMPLETION,
+    DIMINISHING,
+    EXPERT,
+    EXPERTS_POSTERIOR,
+    FEATURES,
+    INDEPENDENT,
+    INDEPENDENT_PREDICATES,
+    KNOWN_TRUTHS,
+    OBSERVATION,
+    OTHER_REPORTS,
+    PREDICATES_SEEN,
+    PROGRAM_SOLVED,
+    SOLVED,
+    WHOLE,
+    Bound,
+)
+from .distance import Perception, posterior_distance, report_distance
+from .theorems import (
+    Regret,
+    _counted,
+    _discounted,
+    _positive,
+    _probability,
+    _session_sizes,
+    failure_probability,
+    lme_constraint_bound,
+    no_regret,
+    size_for,
+)
+
+# -- the constraint bound -----------------------------------------------------------------------------
+
+
+def rimeo_constraint_bound(
+    size: float, samples: float, epsilon: float, epsilon_s: float, perception: Perception, n_features: int
+) -> Bound:
+    """Lemma 4 (chapter 6), Lemma 8 (appendix E), as printed: constraint bound under estimated perception.
+
+    ``(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon_r = epsilon + epsilon_s + L |Psi| epsilon_o`` with
+    probability at least ``max(0, 1 - delta - delta_s - delta_o)``, ``delta_o = 2 K |Psi| exp(-2 n_o
+    epsilon_o^2)``. The module says what is wrong with it; :func:`noisy_constraint_bound` is what can be
+    proved.
+    """
+    lemma = lme_constraint_bound(size, samples, epsilon, epsilon_s, n_features)
+    _counted("predicates", perception.predicates), _counted("longest", perception.longest)
+    deltas = (
+        failure_probability(size, epsilon, n_features),
+        failure_probability(samples, epsilon_s, n_features),
+        failure_probability(perception.samples, perception.epsilon_o, n_features * perception.predicates),
+    )
+    error = lemma.error + perception.longest * perception.predicates * perception.epsilon_o
+    return Bound(
+        "Lemma 4 (Lemma 8 of appendix E)",
+        "(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + epsilon_s + L |Psi| epsilon_o",
+        error,
+        max(0.0, 1 - sum(deltas)),
+        error,
+        (FEATURES, INDEPENDENT, WHOLE, COMPLETION, OBSERVATION, PREDICATES_SEEN),
+    )
+
+
+def noisy_constraint_bound(
+    size: float,
+    epsilon: float,
+    perception: Perception,
+    n_features: int,
+    reliabilities: Float[np.ndarray, " J"] | None = None,
+) -> Bound:
+    """Lemma 4 corrected: ``(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + d`` for all ``k``.
+
+    With probability at least ``max(0, 1 - delta - delta_o)``, ``delta_o = 2 |Psi| exp(-2 n_o epsilon_o^2)``,
+    and ``d`` the :func:`.report_distance`, smaller if the estimated ``reliabilities [J]`` are given.
+    ``phi_hat`` is the posterior's, exact or of independent draws from it, under the expert's weights and
+    reliabilities counted on ``n_o`` other reports whose truth was known.
+    """
+    distance = report_distance(perception, reliabilities)
+    return _corrected(size, epsilon, distance, perception, n_features, (OTHER_REPORTS,))
+
+
+def same_reports_constraint_bound(
+    size: float,
+    epsilon: float,
+    perception: Perception,
+    n_features: int,
+    reliabilities: Float[np.ndarray, " J"],
+) -> Bound:
+    """:func:`noisy_constraint_bound` with ``d`` the :func:`.posterior_distance`.
+
+    Reliabilities may then come from the very reports that the posterior is of.
+    """
+    distance = posterior_distance(perception, reliabilities)
+    return _corrected(size, epsilon, distance, perception, n_features, ())
+
+
+def _corrected(
+    size: float, epsilon: float, distance: float, perception: Perception, n_features: int, more: tuple
+) -> Bound:
+    delta = failure_probability(size, epsilon, n_features)
+    delta_o = failure_probability(perception.samples, perception.epsilon_o, perception.predicates)
+    return Bound(
+        "Lemma 4 (Lemma 8 of appendix E), corrected",
+        "(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + d",
+        epsilon + distance,
+        max(0.0, 1 - delta - delta_o),
+        epsilon + distance,
+        (FEATURES, INDEPENDENT, WHOLE, EXPERTS_POSTERIOR, INDEPENDENT_PREDICATES, KNOWN_TRUTHS, *more),
+    )
+
+
+# -- the log-likelihood -------------------------------------------------------------------------------
+
+
+def rimeo_confidence(
+    size: float,
+    samples: float,
+    epsilon: float,
+    epsilon_s: float,
+    perception: Perception,
+    n_features: int,
+    discount: float,
+) -> Bound:
+    """Theorem 1 (chapter 6), Theorem 6 (appendix E), as printed: confidence for RIMEO.
+
+    ``LL(theta_E) - LL(theta^i) <= 2 K epsilon_r / (1 - gamma)`` with probability ``max(0, 1 - delta_r)``. The
+    likelihood is that of the completed trajectories (the proof's ``Q``), not of the reports. The program's
+    slack has to be ``epsilon_r / (1 - gamma)``; the proof starts with ``epsilon / (1 - gamma)``, for which
+    the step that it cites does not hold. It also takes ``|theta|_1 = 1``, of which ``2 epsilon_r / (1 -
+    gamma)`` follows: the factor ``K`` belongs to weights in [0, 1]^K (:func:`noisy_confidence` has it as
+    ``norm``).
+    """
+    lemma = rimeo_constraint_bound(size, samples, epsilon, epsilon_s, perception, n_features)
+    return Bound(
+        "Theorem 6 of appendix E",
+        "LL(theta_E) - LL(theta) <= 2 K epsilon_r / (1 - gamma)",
+        2 * n_features * lemma.error / (1 - _discounted(discount)),
+        lemma.confidence,
+        lemma.error,
+        (*EXPERT, COMPLETION, OBSERVATION, PREDICATES_SEEN, *PROGRAM_SOLVED),
+    )
+
+
+def noisy_confidence(lemma: Bound, n_features: int, discount: float, norm: float | None = None) -> Bound:
+    """Theorem 6 from a corrected ``lemma``: of the expert's *expected* log-likelihood, as all of
+    :mod:`~i2rl.analysis.bounds.theorems`.
+
+    ``E[LL(theta_E) - LL(theta)] <= 2 epsilon_r |theta_E|_1 / (1 - gamma)`` with the lemma's probability, for
+    the program with slack ``epsilon_r / (1 - gamma)``. ``norm`` is ``|theta_E|_1``; without it the ``K`` of
+    weights in [0, 1].
+    """
+    _counted("n_features", n_features)
+    size = n_features if norm is None else _positive("norm", norm)
+    premises = {a.name: a for a in (*EXPERT, *lemma.assumptions, *PROGRAM_SOLVED)}
+    return lemma._replace(
+        source="Theorem 6 of appendix E, corrected",
+        statement="LL(theta_E) - LL(theta) <= 2 |theta_E|_1 epsilon_r / (1 - gamma)",
+        error=2 * size * lemma.error / (1 - _discounted(discount)),
+        assumptions=tuple(premises.values()),
+    )
+
+
+def perception_needed(
+    n_features: int, predicates: int, longest: int, error: float, confidence: float
+) -> pd.DataFrame:
+    """Data for ``(1 - gamma) |E[phi_k] - phi_hat_k| <= error``, as printed and corrected.
+
+    ``error`` and what is left of ``confidence`` are shared equally by the terms. Returns a table with rows
+    ``printed`` and ``corrected`` and columns ``trajectories``, ``draws`` (of completions), ``reports``
+    (``n_o``) and ``epsilon_o``. Raises ``ValueError`` for an error outside (0, 1], a confidence outside (0,
+    1), or counts below 1.
+    """
+    _counted("predicates", predicates), _counted("longest", longest)
+    if not 0 < error <= 1:
+        raise ValueError(f"the error of an average of values in [0, 1] lies in (0, 1], got {error}")
+    delta, factors = 1 - _probability("confidence", confidence), longest * predicates
+    printed, corrected = error / 3 / factors, -math.expm1(math.log1p(-error / 2) / factors)
+    share, half = size_for(error / 3, delta / 3, n_features), size_for(error / 2, delta / 2, n_features)
+    known = size_for(printed, delta / 3, n_features * predicates), size_for(corrected, delta / 2, predicates)
+    rows = [
+        ("printed", math.ceil(share), math.ceil(share), math.ceil(known[0]), printed),
+        ("corrected", math.ceil(half), 0, math.ceil(known[1]), corrected),
+    ]
+    columns = ["bound", "trajectories", "draws", "reports", "epsilon_o"]
+    return pd.DataFrame(rows, columns=columns).set_index("bound")
+
+
+# -- regret -------------------------------------------------------------------------------------------
+
+
+def rimeo_no_regret(
+    c: float,
+    session_sizes: Int[np.ndarray, " T"] | Sequence[int],
+    session_samples: Int[np.ndarray, " T"] | Sequence[int],
+    session_reports: Int[np.ndarray, " T"] | Sequence[int],
+    predicates: int,
+    longest: int,
+    n_features: int,
+    discount: float,
+) -> Regret:
+    """Theorem 2 (chapter 6), Theorem 7 (appendix E): regret with ``epsilon_{r,i} = c (1 - gamma) / i``.
+
+    The relaxation is spent in thirds on ``epsilon``, ``epsilon_s`` and ``L |Psi| epsilon_o`` (the
+    dissertation leaves it open). ``session_sizes [T]`` are the trajectories of each session,
+    ``session_samples [T]`` the draws ``n_s`` in it, ``session_reports [T]`` what it adds to ``n_o``. What
+    :func:`~i2rl.analysis.bounds.theorems.no_regret` says of ``log T``, of products and of growing sessions
+    holds of all three, see :func:`rimeo_no_regret_sizes`. Besides, ``phi_hat`` averages over sessions (Eq.
+    6.9), of which the early ones were completed with the early models: for ``epsilon_{o,i}`` falling as ``1 /
+    i`` and sessions of one size the average falls as ``log T / T`` only. The theorem holds of a learner that
+    completes all sessions again.
+    """
+    _counted("predicates", predicates), _counted("longest", longest)
+    plain = no_regret(c, session_sizes, n_features, discount)
+    i = np.arange(1, len(plain.average) + 1)
+    third = c * (1 - discount) / i / 3
+    samples, reports = _session_sizes(session_samples), _session_sizes(session_reports)
+    if not len(samples) == len(reports) == len(i):
+        raise ValueError(
+            f"{len(i)} session sizes, but {len(samples)} numbers of samples and {len(reports)} of reports"
+        )
+    epsilon_o = third / (longest * predicates)
+    delta = 2 * n_features * (
+        np.exp(-2 * np.cumsum(_session_sizes(session_sizes)) * third**2)
+        + np.exp(-2 * samples * third**2)
+        + predicates * np.exp(-2 * np.cumsum(reports) * epsilon_o**2)
+    )  # fmt: skip
+    confidence = np.cumprod(np.maximum(0.0, 1 - delta))
+    bound = plain.bound._replace(
+        source="Theorem 7 of appendix E",
+        confidence=max(0.0, 1 - float(delta.sum())),
+        assumptions=(*EXPERT, COMPLETION, OBSERVATION, PREDICATES_SEEN, DIMINISHING, SOLVED),
+        schedule=str(described(Harmonic(c))),
+    )
+    return Regret(plain.average, confidence, bound)
+
+
+def rimeo_no_regret_sizes(
+    c: float, sessions: int, delta: float, predicates: int, longest: int, n_features: int, discount: float
+) -> pd.DataFrame:
+    """Trajectories, draws and reports of each session with which Theorem 7's confidence stays ``1 - delta``.
+
+    The failure probability is spent as in :func:`~i2rl.analysis.bounds.theorems.no_regret_sizes`, in thirds:
+    what a session adds grows about linearly, its draws with the square. Indexed by session, from 1.
+    """
+    _positive("c", c), _counted("sessions", sessions), _counted("n_features", n_features)
+    _counted("predicates", predicates), _counted("longest", longest)
+    i = np.arange(1, sessions + 1)
+    spent = 2 * _probability("delta", delta) / (np.pi * i) ** 2
+    third = c * (1 - _discounted(discount)) / i / 3
+    size = np.log(2 * n_features / spent) / (2 * third**2)
+    known = np.log(2 * n_features * predicates / spent) / 2 * (longest * predicates / third) ** 2
+    return pd.DataFrame(
+        {
+            "trajectories": np.diff(np.ceil(size), prepend=0).astype(int),
+            "draws": np.ceil(size).astype(int),
+            "reports": np.diff(np.ceil(known), prepend=0).astype(int),
+        },
+        index=pd.Index(i, name="session"),
+    )

@@ -1,0 +1,258 @@
+"""How good a learned reward is (section 7.2), and how sure the numbers are.
+
+A learned reward is judged by the behaviour it prescribes, under the expert's true reward: whether it acts
+like the expert, and what it loses. Everything is exact: no simulation, no offset, no rescaling.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float
+
+from ...inference.completion.smoothing import evidence_of, log_likelihoods
+from ...models.inputs.text import shortened
+from ...models.observation.demonstration import Demonstration
+from ...models.observation.evidence import Imperfection, checked_demonstration, fitting_sensor
+from ...models.process.mdp import TabularMDP
+from ...models.process.planning import (
+    deterministic_policy,
+    hard_plan,
+    policy_values,
+    require_discounted,
+    reward_of,
+    soft_plan,
+)
+
+
+class Accuracy(NamedTuple):
+    """Learned behaviour accuracy (LBA): a share in [0, 1] of all states, and of the choice states.
+
+    A *choice state* has more than one available action; elsewhere nothing can be done wrong. Where every
+    state is one (all patrol instances) the two shares are equal; where none is, ``choice`` is NaN.
+    """
+
+    overall: Float[Array, ""]
+    choice: Float[Array, ""]
+
+
+class LearningError(NamedTuple):
+    """Inverse learning error (ILE): ``||V* - V^pi||_1``, and its ratio to ``||V*||_1`` (NaN if that is 0)."""
+
+    absolute: Float[Array, ""]
+    relative: Float[Array, ""]
+
+
+class Evaluation(NamedTuple):
+    """Everything a learned reward is judged by; ``value`` and ``best_value`` start from ``p0``."""
+
+    accuracy: Accuracy
+    error: LearningError
+    value: Float[Array, ""]
+    best_value: Float[Array, ""]
+
+
+def greedy_policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
+    """The deterministic policy that is optimal for ``weights``; ties go to the first action of the MDP.
+
+    Actions within 1e-9 of the best, relative to the spread of the values, count as tied. Raises
+    ``ValueError`` for discount 1, weights of the wrong number, or weights that are not numbers.
+    """
+    return _greedy(mdp, _checked(mdp, weights))
+
+
+def optimal_actions(mdp: TabularMDP, weights: Float[Array, " K"]) -> Bool[Array, "S A"]:
+    """Every action that is optimal for ``weights``; ties and errors as for :func:`greedy_policy`."""
+    return _optimal(mdp, _checked(mdp, weights))
+
+
+def policy_accuracy(mdp: TabularMDP, optimal: Bool[Array, "S A"], policy: Float[Array, "S A"]) -> Accuracy:
+    """Probability that ``policy`` takes one of the ``optimal`` actions, averaged over states.
+
+    For a deterministic policy this is LBA; pass a policy here to break its ties another way. Every optimal
+    action counts as a match.
+    """
+    hit = jnp.sum(jnp.where(optimal, policy, 0.0), axis=1)
+    choice = jnp.sum(mdp.available, axis=1) > 1
+    n = jnp.sum(choice)
+    share = jnp.sum(jnp.where(choice, hit, 0.0)) / jnp.maximum(n, 1)
+    return Accuracy(jnp.mean(hit), jnp.where(n > 0, share, jnp.nan))
+
+
+def policy_error(
+    mdp: TabularMDP, true_weights: Float[Array, " K"], policy: Float[Array, "S A"]
+) -> LearningError:
+    """Inverse learning error of any policy, under the reward of ``true_weights``."""
+    return _policy_error(mdp, _checked(mdp, true_weights), jnp.asarray(policy))
+
+
+def learned_behavior_accuracy(
+    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
+) -> Accuracy:
+    """LBA: share of states where the learned greedy action is one of the expert's optimal actions.
+
+    The learner commits to one action per state, as in :func:`greedy_policy` (so a reward that says nothing
+    is not credited with every action); the expert's ties all count. Source: section 7.2. Errors as there.
+    """
+    return evaluate(mdp, true_weights, learned_weights).accuracy
+
+
+def chance_accuracy(
+    key: Array, mdp: TabularMDP, true_weights: Float[Array, " K"], draws: int = 200
+) -> Float[np.ndarray, " draws"]:
+    """LBA of weights that nobody learned, drawn uniformly from ``[-0.99, 0.99]^K``.
+
+    An accuracy that many of them reach is no sign that anything was learned. Errors as for
+    :func:`greedy_policy`.
+    """
+    drawn = jax.random.uniform(key, (draws, mdp.n_features), float, -0.99, 0.99)
+    return np.asarray(behaviour_accuracies(mdp, optimal_actions(mdp, true_weights), drawn))
+
+
+@jax.jit
+def behaviour_accuracies(
+    mdp: TabularMDP, optimal: Bool[Array, "S A"], weights: Float[Array, "N K"]
+) -> Float[Array, " N"]:
+    """LBA of many weights, of features that need not be the true reward's; ``optimal`` is the expert's."""
+
+    def accuracy(learned: Float[Array, " K"]) -> Float[Array, ""]:
+        policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, learned)).optimal)
+        return policy_accuracy(mdp, optimal, policy).overall
+
+    # One after another: batched factorisations may wait for one another on a CPU with few threads.
+    return lax.map(accuracy, weights)
+
+
+def inverse_learning_error(
+    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
+) -> LearningError:
+    """ILE of :func:`greedy_policy` of the learned weights, in units of discounted true reward.
+
+    ``||V^{pi*} - V^{pi}||_1`` sums over states; both values are exact and under the true reward (chapter 3,
+    section 7.2). Errors as for :func:`greedy_policy`.
+    """
+    return evaluate(mdp, true_weights, learned_weights).error
+
+
+def learned_value(
+    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
+) -> Float[Array, ""]:
+    """Expected discounted true reward ``p0 . V^pi`` of the learned greedy policy."""
+    return evaluate(mdp, true_weights, learned_weights).value
+
+
+def evaluate(
+    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
+) -> Evaluation:
+    """All of the above for the cost of one of them.
+
+    Maps over learned weights ``[N, K]`` with ``jax.vmap(partial(evaluate, mdp, true_weights))``. Raises
+    ``ValueError`` as :func:`greedy_policy` does.
+    """
+    return _evaluate(mdp, _checked(mdp, true_weights), _checked(mdp, learned_weights))
+
+
+def demonstration_log_likelihoods(
+    mdp: TabularMDP, sensor: Imperfection, weights: Float[Array, " K"], demonstration: Demonstration
+) -> Float[Array, " n"]:
+    """Exact log-likelihood (nats) of each trajectory under the soft policy of ``weights``.
+
+    Hidden steps are summed out (section 1 of the methods); ``-inf`` for a trajectory the model rules out.
+    Errors as for :func:`greedy_policy`, and ``ValueError`` for a sensor made for another MDP.
+    """
+    # Padded to a power of two, so that demonstrations of many sizes share a compiled program.
+    sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
+    padded = demonstration.bucketed()
+    return _log_likelihoods(mdp, sensor, _checked(mdp, weights), padded)[: demonstration.n_trajectories]
+
+
+def _checked(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, " K"]:
+    require_discounted(mdp)
+    weights = jnp.asarray(weights, float)
+    if weights.shape != (mdp.n_features,):
+        raise ValueError(f"weights must have shape [{mdp.n_features}], one a feature, got {weights.shape}")
+    # A learner that failed must not be scored by whatever argmax makes of NaN.
+    if not isinstance(weights, jax.core.Tracer) and not np.isfinite(weights).all():
+        k = int(np.flatnonzero(~np.isfinite(weights))[0])
+        raise ValueError(
+            f"the weight of feature {shortened(mdp.feature_names[k])} is {weights[k]}, not a number"
+        )
+    return weights
+
+
+@jax.jit
+def _optimal(mdp: TabularMDP, weights: Float[Array, " K"]) -> Bool[Array, "S A"]:
+    return hard_plan(mdp, reward_of(mdp, weights)).optimal
+
+
+@jax.jit
+def _greedy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
+    return deterministic_policy(hard_plan(mdp, reward_of(mdp, weights)).optimal)
+
+
+@jax.jit
+def _policy_error(
+    mdp: TabularMDP, true_weights: Float[Array, " K"], policy: Float[Array, "S A"]
+) -> LearningError:
+    reward = reward_of(mdp, true_weights)
+    return _error(hard_plan(mdp, reward).values, policy_values(mdp, policy, reward))
+
+
+@jax.jit
+def _evaluate(
+    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
+) -> Evaluation:
+    reward = reward_of(mdp, true_weights)
+    best = hard_plan(mdp, reward)
+    policy = _greedy(mdp, learned_weights)
+    values = policy_values(mdp, policy, reward)
+    return Evaluation(
+        policy_accuracy(mdp, best.optimal, policy),
+        _error(best.values, values),
+        mdp.initial @ values,
+        mdp.initial @ best.values,
+    )
+
+
+def _error(best: Float[Array, " S"], values: Float[Array, " S"]) -> LearningError:
+    loss, scale = jnp.sum(jnp.abs(best - values)), jnp.sum(jnp.abs(best))
+    return LearningError(loss, jnp.where(scale > 0, loss / jnp.where(scale > 0, scale, 1.0), jnp.nan))
+
+
+@jax.jit
+def _log_likelihoods(
+    mdp: TabularMDP, sensor: Imperfection, weights: Float[Array, " K"], demonstration: Demonstration
+) -> Float[Array, " n"]:
+    log_policy = soft_plan(mdp, reward_of(mdp, weights)).log_policy
+    return log_likelihoods(mdp, log_policy, evidence_of(mdp, sensor, demonstration))
+
+
+# -- how sure the numbers are -------------------------------------------------------------------------
+
+
+class Band(NamedTuple):
+    """Median and quantiles of repeated runs."""
+
+    low: Float[np.ndarray, " ..."]
+    median: Float[np.ndarray, " ..."]
+    high: Float[np.ndarray, " ..."]
+
+
+def quantile_band(runs: Float[np.ndarray, "seeds ..."], coverage: float = 0.5) -> Band:
+    """Median and central quantiles over the first axis; ``coverage`` 0.5 gives the quartiles.
+
+    The band says where the middle ``coverage`` of the runs lie; it is not a confidence interval of the
+    median. A NaN among the runs makes its column NaN rather than vanish. Raises ``ValueError`` without
+    runs or for a coverage outside (0, 1).
+    """
+    runs = np.asarray(runs, float)
+    if runs.ndim < 1 or runs.shape[0] == 0:
+        raise ValueError(f"a band needs at least one run along the first axis, got shape {runs.shape}")
+    if not 0 < coverage < 1:
+        raise ValueError(f"coverage must lie in (0, 1), got {coverage}")
+    tail = (1 - coverage) / 2
+    return Band(*np.quantile(runs, [tail, 0.5, 1 - tail], axis=0))

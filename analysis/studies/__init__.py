@@ -1,0 +1,1 @@
+"""Experiments of the dissertation: one room a study."""

@@ -1,0 +1,532 @@
+"""Learning through noisy perception, measured (section 7.4.3): the sensor that is learned, and the behaviour.
+
+Every method learns from the same simulated reports, many streams of them; learners that compile run all their
+streams in one program. The sensor is judged by agreement probabilities, the behaviour by learned behaviour
+accuracy (LBA).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ....domains.noisy.tasks import (
+    NoisyTask,
+    Starts,
+    agreement_probabilities,
+    demonstrate_noisy,
+    noisy_patrol,
+    noisy_sorting,
+)
+from ....domains.patrol.process import instance
+from ....inference.learners.identification import sensor_identifier
+from ....inference.learners.lme import lme_i2rl
+from ....inference.learners.maximum_likelihood import mlirl
+from ....inference.learners.noisy import DEFAULT_ITERATIONS, DEFAULT_RIDGE, rifom, rimeo, robust_irl
+from ....inference.sensors.reliabilities import WithTruth
+from ....inference.sessions.session import Learner, run_sessions, run_streams
+from ....models.observation.demonstration import SEEN, Demonstration
+from ....models.observation.evidence import Imperfection, Sensor, Visibility
+from ....models.process.mdp import TabularMDP
+from ....models.process.planning import deterministic_policy, hard_plan, reachable_states, reward_of
+from ...judging.metrics import chance_accuracy, optimal_actions
+from ..sorting.table import SortingTable
+from .examples import BELTS, SensorPosterior, Strip, sensor_posterior, sorted_belts, strip
+
+Advance = Callable[[str, float | None], None]
+TASKS: Mapping[str, Callable[[], NoisyTask]] = {"sorting": noisy_sorting, "patrol": noisy_patrol}
+TRAJECTORIES, STEPS = 2, 3
+# Where most states are hidden, three steps from anywhere are mostly unseen.
+HIDDEN_STEPS = 10
+OBSERVABILITY = 30
+# Methods that do not compile, or learn once from everything, get so many of the streams.
+FEW = 10
+# The dissertation's divergence settles after so many sessions.
+EARLY = 6
+
+PLAIN, AVERAGED, STEPWISE = "RIMEO, no scores", "RIMEO, scores averaged", "RIMEO, scores stepwise"
+BARE = "RIMEO, predicates alone"
+ORACLE, OBSERVED, ALL = "oracle", "observed", "all, as printed"
+FAIR, CODED = "RIFOM", "RIFOM, as coded"
+KNOWN, CLEAR = "true sensor", "no noise"
+ROBUST, MLIRL = "Robust IRL, batch", "MLIRL, batch"
+HIDDEN, BOTH = "hidden", "hidden and noisy"
+TIMED = (PLAIN, AVERAGED, STEPWISE, FAIR)
+# Learners whose sensor is asked whether the expert's errors could be its own, and their scores.
+DOUBTED = {PLAIN: "none", STEPWISE: "stepwise"}
+STATES = ("all", "choice", "reachable")
+
+# Chances that are not quite zero or one, so that a wrong certainty costs much but not everything.
+_SURE = 1e-12
+
+
+def divergence(
+    truth: Float[np.ndarray, " J"], estimate: Float[np.ndarray, "... J"]
+) -> Float[np.ndarray, "..."]:
+    """Mean over predicates of ``KL(Bernoulli(truth) || Bernoulli(estimate))``, in nats."""
+    p, q = np.asarray(truth, float), np.clip(np.asarray(estimate, float), _SURE, 1 - _SURE)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        right = np.where(p > 0, p * np.log(p / q), 0.0)
+        wrong = np.where(p < 1, (1 - p) * np.log((1 - p) / (1 - q)), 0.0)
+    mean: np.ndarray = np.maximum(right + wrong, 0.0).mean(-1)
+    return mean
+
+
+class MeanInterval(NamedTuple):
+    """A mean over runs and its 95 % interval."""
+
+    mean: Float[np.ndarray, "..."]
+    low: Float[np.ndarray, "..."]
+    high: Float[np.ndarray, "..."]
+
+
+def mean_interval(runs: Float[np.ndarray, "runs ..."]) -> MeanInterval:
+    """Mean over the first axis, with the normal distribution's interval; NaN at its ends for one run."""
+    runs = np.asarray(runs, float)
+    mean, n = runs.mean(0), len(runs)
+    half = 1.96 * runs.std(0, ddof=1) / np.sqrt(n) if n > 1 else np.full_like(mean, np.nan)
+    return MeanInterval(mean, mean - half, mean + half)
+
+
+class Streams(NamedTuple):
+    """What learners get: ``seen`` and ``truth`` with arrays ``[runs, sessions, trajectories, steps]``.
+
+    ``mdp`` is the process with the start that was simulated.
+    """
+
+    seen: Demonstration
+    truth: Demonstration
+    mdp: TabularMDP
+
+    def session(self, run: int, session: int, of: str = "seen") -> Demonstration:
+        """One session, counted from zero."""
+        return Demonstration(*(np.asarray(x)[run, session] for x in getattr(self, of)))
+
+    def whole(self, run: int, of: str = "seen") -> Demonstration:
+        """All trajectories of a run."""
+        arrays = getattr(self, of)
+        return Demonstration(*(np.asarray(x)[run].reshape(-1, x.shape[-1]) for x in arrays))
+
+
+def draw_streams(
+    key: Array,
+    task: NoisyTask,
+    *,
+    runs: int,
+    sessions: int,
+    starts: Starts = "all",
+    steps: int = STEPS,
+    noise: Imperfection | None = None,
+    view: Visibility | None = None,
+) -> Streams:
+    """Independent streams with calibrated scores, all trajectories drawn in one go.
+
+    Raises ``ValueError`` as :func:`demonstrate_noisy` does.
+    """
+    drawn = demonstrate_noisy(
+        key, task, noise, sessions=runs * sessions, trajectories=TRAJECTORIES, steps=steps, starts=starts,
+        scores="calibrated", view=view,
+    )  # fmt: skip
+    shape = (runs, sessions, TRAJECTORIES, steps)
+    seen, truth = (
+        Demonstration(*(np.asarray(x).reshape(shape) for x in d)) for d in (drawn.seen, drawn.truth)
+    )
+    return Streams(seen, truth, drawn.mdp)
+
+
+class MethodResult(NamedTuple):
+    """One method on its streams.
+
+    Fields
+    ------
+    name : str
+    sessions : int ``[T]``
+        After which it was measured.
+    weights : float ``[runs, T, K]``
+    agreement : float ``[runs, T, J]`` or None
+        Learned agreement probabilities of what the learner knows, the task's predicates first.
+    divergence : float ``[runs, T]`` or None
+        Of the predicates' from the true ones, mean over predicates, in nats.
+    accuracy : float ``[runs, T, 3]``
+        LBA over :data:`STATES`.
+    state
+        The learner's final states (leading axis: runs), None for those that have none.
+    """
+
+    name: str
+    sessions: Int[np.ndarray, " T"]
+    weights: Float[np.ndarray, "runs T K"]
+    agreement: Float[np.ndarray, "runs T J"] | None
+    divergence: Float[np.ndarray, "runs T"] | None
+    accuracy: Float[np.ndarray, "runs T 3"]
+    state: Any = None
+
+
+class SensorDoubt(NamedTuple):
+    """Whether the learned sensors are known, by run: see :mod:`i2rl.inference.learners.identification`.
+
+    Fields
+    ------
+    erratic, decided : float ``[runs, J]``
+        Agreement of the task's predicates, by what is assumed of the expert.
+    identified : bool ``[runs, J]``
+    """
+
+    erratic: Float[np.ndarray, "runs J"]
+    decided: Float[np.ndarray, "runs J"]
+    identified: Bool[np.ndarray, "runs J"]
+
+    @property
+    def known(self) -> float:
+        """Share of runs in which all predicates are identified."""
+        return float(self.identified.all(1).mean())
+
+
+class NoisyStudy(NamedTuple):
+    """Settings, streams and results.
+
+    Fields
+    ------
+    task : NoisyTask
+    starts, runs, sessions, seed
+    streams : Streams
+    true_agreement : float ``[J]``
+        Of the task's predicates, among the expert's pairs.
+    states : bool ``[3, S]``
+        Over which accuracy is averaged, see :data:`STATES`.
+    results : mapping from a method's name to MethodResult
+    seconds : mapping from a method's name to float
+        Median of a session once compiled, for :data:`TIMED`.
+    doubt : mapping from a method's name to SensorDoubt
+        For :data:`DOUBTED`, on the first :data:`FEW` streams.
+    hidden : mapping, or None
+        Where most of the patrol is out of view: results with noise and without.
+    posterior : SensorPosterior or None
+        Of the first stream's first :data:`EARLY` sessions.
+    strip : Strip
+        Another trajectory, as the learner of the first stream understands it in the end.
+    belts : SortingTable or None
+        Of the sorting task.
+    chance : float ``[draws]``
+        LBA over all states of random weights.
+    """
+
+    task: NoisyTask
+    starts: Starts
+    runs: int
+    sessions: int
+    seed: int
+    streams: Streams
+    true_agreement: Float[np.ndarray, " J"]
+    states: Bool[np.ndarray, "3 S"]
+    results: Mapping[str, MethodResult]
+    seconds: Mapping[str, float]
+    doubt: Mapping[str, SensorDoubt]
+    hidden: Mapping[str, MethodResult] | None
+    posterior: SensorPosterior | None
+    strip: Strip
+    belts: SortingTable | None
+    chance: Float[np.ndarray, " draws"]
+
+    @property
+    def control(self) -> float:
+        """Divergence of the constant estimate one half."""
+        return float(divergence(self.true_agreement, np.full_like(self.true_agreement, 0.5)))
+
+
+# -- methods ------------------------------------------------------------------------------------------
+
+
+class _Entry(NamedTuple):
+    """How a learner is made, what it is fed, and whether it estimates agreement."""
+
+    learner: Callable[[TabularMDP, NoisyTask], Learner]
+    fed: str = "seen"
+    perceives: bool = True
+
+
+def _plain_learner(mdp: TabularMDP, sensor: Imperfection) -> Learner:
+    """Maximum-entropy IRL whose settings are those of RIMEO, the sensor being known."""
+    return lme_i2rl(mdp, sensor, slack=0.0, ridge=DEFAULT_RIDGE, iterations=DEFAULT_ITERATIONS)
+
+
+LEARNERS: Mapping[str, _Entry] = {
+    PLAIN: _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="none")),
+    AVERAGED: _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="averaged")),
+    STEPWISE: _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="stepwise")),
+    BARE: _Entry(lambda mdp, task: rimeo(mdp, task.predicates, scores="none")),
+    ORACLE: _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="none", truths="oracle"), "both"),
+    OBSERVED: _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="none", truths="observed")),
+    FAIR: _Entry(lambda mdp, task: rifom(mdp, task.features)),
+    CODED: _Entry(lambda mdp, task: rifom(mdp, task.predicates, form="coded")),
+    ALL: _Entry(lambda mdp, task: rimeo(mdp, task.predicates, truths="all")),
+    KNOWN: _Entry(lambda mdp, task: _plain_learner(mdp, task.noise), perceives=False),
+    CLEAR: _Entry(lambda mdp, task: _plain_learner(mdp, Sensor()), "truth", perceives=False),
+}
+METHODS = (*LEARNERS, ROBUST, MLIRL)
+
+
+class _Judge(NamedTuple):
+    """What learned agreement and weights are compared with."""
+
+    task: NoisyTask
+    true_agreement: Float[np.ndarray, " J"]
+    states: Bool[np.ndarray, "3 S"]
+
+    def result(
+        self,
+        name: str,
+        sessions: Int[np.ndarray, " T"],
+        weights: Any,
+        agreement: Any = None,
+        state: Any = None,
+    ) -> MethodResult:
+        weights = np.asarray(weights)
+        optimal = optimal_actions(self.task.mdp, jnp.asarray(self.task.weights))
+        hits = np.asarray(_hits(self.task.mdp, optimal, jnp.asarray(weights.reshape(-1, weights.shape[-1]))))
+        shares = (hits @ self.states.T / self.states.sum(1)).reshape(*weights.shape[:-1], len(STATES))
+        if agreement is None:
+            return MethodResult(name, sessions, weights, None, None, shares, state)
+        agreement = np.asarray(agreement)
+        apart = divergence(self.true_agreement, agreement[..., : len(self.true_agreement)])
+        return MethodResult(name, sessions, weights, agreement, apart, shares, state)
+
+    def online(
+        self, name: str, key: Array, learner: Learner, streams: Streams, entry: _Entry
+    ) -> MethodResult:
+        """A learner on all streams."""
+        weights, agreement, state = _learned(key, learner, streams, entry)
+        return self.result(name, np.arange(1, streams.seen.kind.shape[1] + 1), weights, agreement, state)
+
+    def batch(self, name: str, key: Array, streams: Streams) -> MethodResult:
+        """A learner that is given all of a stream at once, on a few streams."""
+        runs, sessions = streams.seen.kind.shape[:2]
+        robust = robust_irl(streams.mdp, self.task.noise, slack=0.0, ridge=DEFAULT_RIDGE)
+        weights = []
+        for run in range(min(runs, FEW)):
+            reports, own = streams.whole(run), jax.random.fold_in(key, run)
+            if name == ROBUST:
+                weights.append(robust.fit(own, reports).weights)
+            else:
+                weights.append(mlirl(own, *taken_at_face_value(streams.mdp, reports)).weights)
+        return self.result(name, np.array([sessions]), np.array(weights)[:, None])
+
+
+@jax.jit
+def _hits(mdp: TabularMDP, optimal: Bool[Array, "S A"], weights: Float[Array, "N K"]) -> Float[Array, "N S"]:
+    """Where the greedy policy of each weights does what an expert does."""
+
+    def one(w: Float[Array, " K"]) -> Float[Array, " S"]:
+        policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, w)).optimal)
+        return jnp.sum(jnp.where(optimal, policy, 0.0), axis=1)
+
+    # One after another: batched factorisations may wait for one another on a CPU with few threads.
+    return lax.map(one, weights)
+
+
+def _judged_states(task: NoisyTask) -> Bool[np.ndarray, "3 S"]:
+    """All states, those with a choice, and those that can be reached from where the task naturally starts."""
+    available = np.asarray(task.mdp.available)
+    return np.stack([np.ones(len(available), bool), available.sum(1) > 1, reachable_states(task.mdp)])
+
+
+def _learned(key: Array, learner: Learner, streams: Streams, entry: _Entry) -> tuple:
+    """Weights and agreement after every session, and the final states."""
+    runs = len(streams.seen.kind)
+    if learner.session is None:
+        kept = [_one_by_one(jax.random.fold_in(key, r), learner, streams, r) for r in range(min(runs, FEW))]
+        weights, agreement = (np.array(x) for x in zip(*kept, strict=True))
+        return weights, agreement, None
+    fed = {
+        "seen": streams.seen,
+        "truth": streams.truth,
+        "both": WithTruth(streams.seen, streams.truth),
+    }[entry.fed]
+    keep = partial(_kept, entry.perceives)
+    state, (weights, agreement) = run_streams(learner, key, fed, keep)  # type: ignore[arg-type]
+    return weights, agreement if entry.perceives else None, state
+
+
+def _kept(perceives: bool, state: Any, report: Any) -> tuple:
+    return report.weights, report.agreement if perceives else report.weights
+
+
+def _one_by_one(key: Array, learner: Learner, streams: Streams, run: int) -> tuple:
+    sessions = streams.seen.kind.shape[1]
+    reports: Any = run_sessions(learner, (streams.session(run, t) for t in range(sessions)), key=key).reports
+    return [report.weights for report in reports], [report.agreement for report in reports]
+
+
+def taken_at_face_value(mdp: TabularMDP, reports: Demonstration) -> tuple[TabularMDP, Demonstration]:
+    """Reports as what they say, for a learner that knows no noise: each pair by itself, anywhere.
+
+    Wrong reports follow one another as no process could, so transitions say nothing; pairs that are not
+    offered at all are dropped.
+    """
+    seen = np.asarray(reports.kind) == SEEN
+    states, actions = np.asarray(reports.state)[seen], np.asarray(reports.action)[seen]
+    offered = np.asarray(mdp.available)[states, actions]
+    anywhere = mdp.with_initial(jnp.full(mdp.n_states, 1 / mdp.n_states))
+    return anywhere, Demonstration.from_pairs(states[offered, None], actions[offered, None])
+
+
+def _doubted(task: NoisyTask, streams: Streams, result: MethodResult, scores: str) -> SensorDoubt:
+    identify = sensor_identifier(streams.mdp, task.features, scores=scores)
+    found = [
+        identify(streams.whole(run), result.weights[run, -1]) for run in range(min(len(result.weights), FEW))
+    ]
+    n_predicates = len(task.predicates)
+    erratic, decided, identified = (
+        np.array([getattr(x, name)[:n_predicates] for x in found])
+        for name in ("erratic", "decided", "identified")
+    )
+    return SensorDoubt(erratic, decided, identified)
+
+
+# -- the study ----------------------------------------------------------------------------------------
+
+
+def study(
+    name: str,
+    *,
+    runs: int = 50,
+    sessions: int = 20,
+    starts: Starts = "all",
+    seed: int = 0,
+    belts: int = BELTS,
+    draws: int = 100,
+    methods: Sequence[str] | None = None,
+    advance: Advance = lambda description, fraction: None,
+) -> NoisyStudy:
+    """Learn the ``"sorting"`` or the ``"patrol"`` task through its noise with every method.
+
+    Parameters
+    ----------
+    name : {"sorting", "patrol"}
+    runs, sessions : int
+        Independent streams, and sessions of each: two trajectories of three pairs. Learners in batch, and
+        those outside JAX, get the first :data:`FEW` streams.
+    starts : {"all", "natural"}
+        Trajectories start in all states alike, or where the task naturally does.
+    seed : int
+    belts : int
+        Simulated belts for each method (sorting).
+    draws : int
+        Of each of two chains of the joint posterior; none is sampled for zero.
+    methods : sequence of str, optional
+        Some of :data:`METHODS` besides :data:`PLAIN`, which is always there; all by default.
+
+    Raises
+    ------
+    ValueError
+        For a task or method that does not exist, other starts, and numbers below one.
+    """
+    if name not in TASKS:
+        raise ValueError(f"tasks are {', '.join(TASKS)}; got {name!r}")
+    for what, number in (("runs", runs), ("sessions", sessions), ("belts", belts)):
+        if number < 1:
+            raise ValueError(f"{what} must be at least 1, got {number}")
+    if draws < 0:
+        raise ValueError(f"draws must not be negative, got {draws}")
+    unknown = [method for method in methods or () if method not in METHODS]
+    if unknown:
+        raise ValueError(f"methods are {'; '.join(METHODS)}; got {unknown[0]!r}")
+    task = TASKS[name]()
+    chosen = [m for m in METHODS if methods is None or m in methods or m == PLAIN]
+    draw, learn, hide, show = jax.random.split(jax.random.key(seed), 4)
+    streams = draw_streams(draw, task, runs=runs, sessions=sessions, starts=starts)
+    pairs = task.pair_distribution(starts, STEPS)
+    judge = _Judge(task, agreement_probabilities(task.noise, task.predicates, pairs), _judged_states(task))
+    results = {}
+    for i, method in enumerate(chosen):
+        advance(method, i / (len(chosen) + 3))
+        if method in LEARNERS:
+            entry = LEARNERS[method]
+            results[method] = judge.online(method, learn, entry.learner(streams.mdp, task), streams, entry)
+        else:
+            results[method] = judge.batch(method, learn, streams)
+    advance("timing", len(chosen) / (len(chosen) + 3))
+    seconds = _seconds([method for method in TIMED if method in results], task, streams)
+    doubt = {m: _doubted(task, streams, results[m], scores) for m, scores in DOUBTED.items() if m in results}
+    advance("out of view", (len(chosen) + 1) / (len(chosen) + 3))
+    hidden = _hidden(hide, judge, runs, sessions, starts) if name == "patrol" else None
+    advance("examples", (len(chosen) + 2) / (len(chosen) + 3))
+    posterior, happened, sorted_ = _examples(show, judge, streams, results, starts, pairs, belts, draws)
+    advance("done", 1.0)
+    return NoisyStudy(
+        task, starts, runs, sessions, seed, streams, judge.true_agreement, judge.states, results, seconds,
+        doubt, hidden, posterior, happened, sorted_,
+        chance_accuracy(jax.random.fold_in(show, 200), task.mdp, jnp.asarray(task.weights)),
+    )  # fmt: skip
+
+
+def _seconds(methods: Sequence[str], task: NoisyTask, streams: Streams) -> dict[str, float]:
+    """Of the first stream, gone through twice: compiled in one pass, timed in the other.
+
+    Learners take turns, so that whatever else the machine does slows all of them alike.
+    """
+    learners = [LEARNERS[method].learner(streams.mdp, task) for method in methods]
+    for _ in range(2):
+        states: list[Any] = [learner.init(jax.random.key(0)) for learner in learners]
+        taken: list[list[float]] = [[] for _ in learners]
+        for t in range(streams.seen.kind.shape[1]):
+            session = streams.session(0, t)
+            for i, learner in enumerate(learners):
+                states[i], report = learner.update(states[i], session)
+                taken[i].append(report.seconds)
+    return {method: float(np.median(seconds)) for method, seconds in zip(methods, taken, strict=True)}
+
+
+def _hidden(key: Array, judge: _Judge, runs: int, sessions: int, starts: Starts) -> dict[str, MethodResult]:
+    """Most states out of view: without noise, and with noise that is learned; the same paths are walked."""
+    view = instance(2).visibility(OBSERVABILITY)
+    draw, learn = jax.random.split(key)
+    # Until something is seen there is no agreement to judge.
+    clear = _Entry(lambda mdp, task: _plain_learner(mdp, view), perceives=False)
+    noisy = _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="none", view=view), perceives=False)
+    results = {}
+    for method, noise, entry in ((HIDDEN, noisy_patrol(0.0).noise, clear), (BOTH, judge.task.noise, noisy)):
+        streams = draw_streams(
+            draw, judge.task, runs=runs, sessions=sessions, starts=starts, steps=HIDDEN_STEPS, noise=noise,
+            view=view,
+        )  # fmt: skip
+        learner = entry.learner(streams.mdp, judge.task)
+        results[method] = judge.online(method, learn, learner, streams, entry)
+    return results
+
+
+def _examples(
+    key: Array,
+    judge: _Judge,
+    streams: Streams,
+    results: Mapping[str, MethodResult],
+    starts: Starts,
+    pairs: Float[np.ndarray, "S A"],
+    belts: int,
+    draws: int,
+) -> tuple[SensorPosterior | None, Strip, SortingTable | None]:
+    """Of the first stream: its early sessions' posterior, and a new trajectory as it is understood."""
+    learned, early = results[PLAIN], min(EARLY, streams.seen.kind.shape[1])
+    assert learned.agreement is not None
+    sample, walk, belt = jax.random.split(key, 3)
+    first = slice(0, early * TRAJECTORIES)
+    seen, truth = (streams.whole(0, of).select(first) for of in ("seen", "truth"))
+    posterior = None
+    if draws:
+        estimate = learned.agreement[0, early - 1]
+        posterior = sensor_posterior(
+            sample, judge.task, streams.mdp, seen, truth, estimate, pairs, draws=draws, warmup=draws
+        )
+    reliabilities = jax.nn.sigmoid(learned.state.logits[0])
+    happened = strip(walk, judge.task, learned.weights[0, -1], np.asarray(reliabilities))
+    if judge.task.name == TASKS["patrol"]().name:
+        return posterior, happened, None
+    sorters = {m: results[m].weights[:, -1] for m in (AVERAGED, STEPWISE, PLAIN, FAIR, MLIRL) if m in results}
+    return posterior, happened, sorted_belts(belt, judge.task, sorters, belts=belts)

@@ -1,0 +1,575 @@
+"""The main job: learn a patrol's rewards online through a keyhole, and walk past the patrollers unseen."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Float
+
+from ....domains.patrol.process import Patrol, demonstrate, instance, simulate_patrol
+from ....domains.patrol.trials import REACHED, TIMED_OUT, BreachOutcome, breach_trials, greedy_policies
+from ....inference.completion.smoothing import evidence_of, smooth_all
+from ....inference.learners.lme import batch_lme, lme_i2rl, lme_i2rl_with_random_weights
+from ....inference.sessions.session import Learner, run_sessions
+from ....models.observation.demonstration import SEEN, Demonstration, concatenate
+from ....models.observation.evidence import observe
+from ....models.process.planning import reward_of, soft_plan
+from ...drawing.charts import (
+    LearningCurve,
+    LearningTime,
+    SuccessRate,
+    learning_curves,
+    learning_time,
+    success_rates,
+)
+from ...drawing.maps import hidden_path, policy_map
+from ...drawing.page import Lead, Section, Table, drawn, write_page
+from ...drawing.page import print_tables as print_page_tables
+from ...drawing.results import plain, study_provenance
+from ...drawing.style import Theme
+from ...drawing.text import counted, listed, number
+from ...judging.metrics import chance_accuracy, demonstration_log_likelihoods, evaluate
+from ...posteriors.identifiability import Identifiability, identifiability_of, identifiability_section
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+    from rich.console import Console
+
+ONLINE, FORGETFUL, BATCH, RANDOM, TRUE = (
+    "LME-I2RL", "LME-I2RL with random weights", "batch LME", "random weights", "true policy",
+)  # fmt: skip
+# Names on the command line.
+METHODS = {"lme-i2rl": ONLINE, "batch": BATCH, "random": RANDOM}
+STEPS_PER_SESSION = 5
+# Numbers of trajectories at which batch is timed and judged.
+BATCH_POINTS = 7
+# Lengths that the true weights are stretched to.
+STRETCHES = 2.0 ** np.arange(-2, 14)
+
+Advance = Callable[[str, float | None], None]
+
+
+class MethodResult(NamedTuple):
+    """What a method reached; the first axis runs over independent runs and the patrollers of each.
+
+    Fields
+    ------
+    name : str
+    points : int ``[T]``
+        Sessions at which the rest was measured.
+    weights : float ``[runs, patrollers, T, K]``
+    accuracy, choice_accuracy : float ``[runs * patrollers, T]``
+        LBA over all states and over states with a choice.
+    error : float ``[runs * patrollers, T]``
+        ILE relative to the value of the optimal policy.
+    log_likelihood : float ``[runs * patrollers, T]``
+        Exact, of fresh demonstrations that nobody learned from; nats per trajectory.
+    seconds : float ``[runs, T]``
+        Learning time up to there, all patrollers together.
+    breach : BreachOutcome or None
+        All runs' trials together.
+    """
+
+    name: str
+    points: np.ndarray
+    weights: np.ndarray
+    accuracy: np.ndarray
+    choice_accuracy: np.ndarray
+    error: np.ndarray
+    log_likelihood: np.ndarray
+    seconds: np.ndarray
+    breach: BreachOutcome | None
+
+
+class Study(NamedTuple):
+    """A study of one patrol: settings, the methods' results, and one stretch the first learner looked at."""
+
+    patrol: Patrol
+    observability: int
+    sessions: int
+    trials: int
+    runs: int
+    seed: int
+    methods: tuple[MethodResult, ...]
+    batch_rerun_seconds: np.ndarray | None
+    stretch: Stretch
+    determined: tuple[Identifiability, ...]
+    chance: Float[np.ndarray, " draws"]
+    truth: TrueLikelihood
+
+
+class TrueLikelihood(NamedTuple):
+    """Log-likelihood of the true weights at several lengths: an expert who never errs gives them none.
+
+    Fields
+    ------
+    lengths : float ``[L]``
+        Factors that the true weights are multiplied by.
+    values : float ``[L]``
+        Of the fresh demonstrations that methods are judged by; nats per trajectory.
+    """
+
+    lengths: Float[np.ndarray, " L"]
+    values: Float[np.ndarray, " L"]
+
+    @property
+    def as_given(self) -> float:
+        """At the true weights themselves."""
+        return float(self.values[self.lengths == 1][0])
+
+    @property
+    def best(self) -> tuple[float, float]:
+        """The length with the highest likelihood, and that."""
+        i = int(np.argmax(self.values))
+        return float(self.lengths[i]), float(self.values[i])
+
+
+class Stretch(NamedTuple):
+    """A fresh stretch of patrol, the belief about it, and the truth."""
+
+    posterior: Float[np.ndarray, "L S"]
+    seen: np.ndarray
+    path: np.ndarray
+
+
+def study(
+    number: int = 2,
+    observability: int | None = None,
+    *,
+    sessions: int = 60,
+    trials: int = 200,
+    runs: int = 3,
+    seed: int = 0,
+    methods: Sequence[str] | None = None,
+    advance: Advance = lambda description, fraction: None,
+) -> Study:
+    """Learn, evaluate and (instances 2 and 3) breach.
+
+    ``runs`` independent demonstrations are learned from, one learner per patroller; each learned set of
+    policies then tries ``trials`` breaches, with the time it took to learn on the clock. ``methods`` names
+    some of ``lme-i2rl``, ``batch`` and ``random`` (all by default). Raises ``ValueError`` for an instance,
+    observability or method that does not exist.
+    """
+    patrol = instance(number)
+    observability = patrol.observability if observability is None else observability
+    view = patrol.visibility(observability)
+    unknown = [m for m in methods or () if m not in METHODS]
+    if unknown:
+        raise ValueError(f"method must be one of {', '.join(METHODS)}, got {unknown[0]!r}")
+    wanted = {METHODS[m] for m in methods} if methods else {ONLINE, FORGETFUL, BATCH, RANDOM}
+    keys = jax.random.split(jax.random.key(seed), runs)
+    data = [demonstrate(k, patrol, observability, sessions, STEPS_PER_SESSION) for k in keys]
+    learners = {
+        ONLINE: partial(_online, lme_i2rl(patrol.mdp, view)),
+        FORGETFUL: partial(_online, lme_i2rl_with_random_weights(patrol.mdp, view)),
+        BATCH: partial(_batch, batch_lme(patrol.mdp, view)),
+        RANDOM: partial(_random, patrol),
+        TRUE: partial(_true, patrol),
+    }
+    results: list[MethodResult] = []
+    rerun = None
+    names = [n for n in learners if n in wanted or n == TRUE]
+    stages = 2 * len(names)
+    for name in names:
+        advance(f"learning: {name}", len(results) * 2 / stages)
+        learned = [
+            learners[name](key, demonstrations) for key, demonstrations in zip(keys, data, strict=True)
+        ]
+        if name == BATCH:
+            rerun = np.stack([_interpolated_sum(one.points, one.seconds) for one in learned])
+        advance(f"breaching: {name}", (len(results) * 2 + 1) / stages)
+        results.append(_evaluated(patrol, observability, name, learned, keys, sessions, trials))
+    first = results[0]
+    stretch = _stretch(jax.random.fold_in(keys[0], 7), patrol, observability, first.weights[0, 0, -1])
+    # What the first run's demonstrations say of each patroller, where something was learned from them.
+    known = data[0] if first.name not in (RANDOM, TRUE) else ()
+    determined = tuple(
+        identifiability_of(patrol.mdp, view, demonstration, jnp.asarray(weights[-1]))
+        for demonstration, weights in zip(known, first.weights[0], strict=False)
+    )
+    chance = chance_accuracy(jax.random.fold_in(keys[0], 200), patrol.mdp, jnp.asarray(patrol.weights))
+    truth = TrueLikelihood(
+        STRETCHES, _likelihoods(patrol, observability, STRETCHES[:, None] * np.asarray(patrol.weights))
+    )
+    advance("done", 1.0)
+    return Study(
+        patrol, observability, sessions, trials, runs, seed, tuple(results), rerun, stretch, determined,
+        chance, truth,
+    )  # fmt: skip
+
+
+class _Learned(NamedTuple):
+    """One run of one method: sessions ``[T]``, ``weights [P, T, K]``, cumulative seconds ``[T]``."""
+
+    points: np.ndarray
+    weights: np.ndarray
+    seconds: np.ndarray
+
+
+def _online(learner: Learner, key: jax.Array, demonstrations: Sequence[Demonstration]) -> _Learned:
+    # One session first, unrecorded, so that compilation is not counted as learning.
+    learner.update(learner.init(key), demonstrations[0].select([0]))
+    runs = [
+        run_sessions(learner, d.sessions(), key=jax.random.fold_in(key, p)).reports
+        for p, d in enumerate(demonstrations)
+    ]
+    weights = np.array([[r.weights for r in reports] for reports in runs])
+    seconds = np.cumsum(np.sum([[r.seconds for r in reports] for reports in runs], axis=0))
+    return _Learned(np.arange(1, weights.shape[1] + 1), weights, seconds)
+
+
+def _batch(batch: Any, key: jax.Array, demonstrations: Sequence[Demonstration]) -> _Learned:
+    import time
+
+    n = demonstrations[0].n_trajectories
+    points = np.unique(np.geomspace(min(5, n), n, BATCH_POINTS).round().astype(int))
+    weights, seconds = [], []
+    for count in points:
+        part = [d.select(slice(0, int(count))) for d in demonstrations]
+        batch.fit(key, part[0])  # compiled for this size before the clock starts
+        began = time.perf_counter()
+        fits = [batch.fit(key, d) for d in part]
+        seconds.append(time.perf_counter() - began)
+        weights.append([fit.weights for fit in fits])
+    return _Learned(points, np.swapaxes(weights, 0, 1), np.array(seconds))
+
+
+def _random(patrol: Patrol, key: jax.Array, demonstrations: Sequence[Demonstration]) -> _Learned:
+    shape = (patrol.patrollers, 1, patrol.mdp.n_features)
+    weights = np.asarray(jax.random.uniform(key, shape, float, -0.99, 0.99))
+    return _not_learned(weights, demonstrations)
+
+
+def _likelihoods(
+    patrol: Patrol, observability: int, weights: Float[np.ndarray, "n K"]
+) -> Float[np.ndarray, " n"]:
+    """Nats per trajectory of fresh demonstrations, the same for everybody and learned from by nobody."""
+    fresh = concatenate(demonstrate(jax.random.key(10**6), patrol, observability, 60, STEPS_PER_SESSION))
+    view = patrol.visibility(observability)
+    likelihood = lax.map(
+        lambda w: jnp.mean(demonstration_log_likelihoods(patrol.mdp, view, w, fresh)),
+        jnp.asarray(weights), batch_size=16,
+    )  # fmt: skip
+    return np.asarray(likelihood)
+
+
+def _true(patrol: Patrol, key: jax.Array, demonstrations: Sequence[Demonstration]) -> _Learned:
+    del key
+    weights = np.broadcast_to(patrol.weights, (patrol.patrollers, 1, patrol.mdp.n_features))
+    return _not_learned(weights, demonstrations)
+
+
+def _not_learned(weights: np.ndarray, demonstrations: Sequence[Demonstration]) -> _Learned:
+    points = np.array([demonstrations[0].n_trajectories])
+    return _Learned(points, weights, np.zeros(1))
+
+
+def _interpolated_sum(points: np.ndarray, seconds: np.ndarray) -> np.ndarray:
+    """Cumulative cost of running batch again after every session, between the points it was timed at."""
+    return np.cumsum(np.interp(np.arange(1, points[-1] + 1), points, seconds))
+
+
+def _evaluated(
+    patrol: Patrol,
+    observability: int,
+    name: str,
+    learned: Sequence[_Learned],
+    keys: jax.Array,
+    sessions: int,
+    trials: int,
+) -> MethodResult:
+    weights = np.stack([one.weights for one in learned])
+    runs, patrollers, n, k = weights.shape
+    scores = jax.vmap(partial(evaluate, patrol.mdp, jnp.asarray(patrol.weights)))(
+        jnp.asarray(weights).reshape(-1, k)
+    )
+    shape = (runs * patrollers, n)
+    likelihood = _likelihoods(patrol, observability, weights.reshape(-1, k))
+    breach = None
+    if patrol.breach is not None:
+        outcomes = [
+            breach_trials(
+                jax.random.fold_in(key, 99), patrol, greedy_policies(patrol, weights[i, :, -1]),
+                observability=observability, observed_steps=sessions * STEPS_PER_SESSION, trials=trials,
+                learning_seconds=float(learned[i].seconds[-1]),
+            )
+            for i, key in enumerate(keys)
+        ]  # fmt: skip
+        breach = BreachOutcome(
+            np.concatenate([o.ended for o in outcomes]), np.concatenate([o.waited for o in outcomes]),
+            float(np.mean([o.threshold for o in outcomes])),
+        )  # fmt: skip
+    return MethodResult(
+        name, learned[0].points, weights, np.asarray(scores.accuracy.overall).reshape(shape),
+        np.asarray(scores.accuracy.choice).reshape(shape), np.asarray(scores.error.relative).reshape(shape),
+        likelihood.reshape(shape), np.stack([one.seconds for one in learned]), breach,
+    )  # fmt: skip
+
+
+def _stretch(key: jax.Array, patrol: Patrol, observability: int, weights: np.ndarray) -> Stretch:
+    """One round of a patroller that was not learned from, and what the learned weights say about it."""
+    policy = jnp.log(jnp.asarray(patrol.expert_policy()))[None]
+    first, walk, look = jax.random.split(key, 3)
+    # Started in view, so that the first hidden gap lies between two sightings.
+    inside = jnp.asarray(patrol.views[observability]) & (patrol.mdp.initial > 0)
+    start = jax.random.categorical(first, jnp.where(inside, 0.0, -jnp.inf), shape=(1,))
+    states, actions = simulate_patrol(walk, patrol, policy, start, int(1.5 * patrol.loop))
+    view = patrol.visibility(observability)
+    demonstration = Demonstration.from_codes(np.asarray(observe(look, view, states[0], actions[0]))[None])
+    plan = soft_plan(patrol.mdp, reward_of(patrol.mdp, jnp.asarray(weights)))
+    posterior = smooth_all(patrol.mdp, plan.log_policy, evidence_of(patrol.mdp, view, demonstration))
+    return Stretch(
+        np.asarray(posterior.pairs[0].sum(-1)), demonstration.kind[0] == SEEN, np.asarray(states[0])
+    )
+
+
+# -- telling --------------------------------------------------------------------------------------------
+
+
+def _rows(study: Study) -> list[dict[str, Any]]:
+    rows = []
+    for m in study.methods:
+        learns = m.name not in (RANDOM, TRUE)
+        row: dict[str, Any] = {
+            "method": m.name,
+            "log-likelihood": float(np.median(m.log_likelihood[:, -1])),
+            "LBA": float(np.median(m.accuracy[:, -1])),
+            "LBA choice states": float(np.median(m.choice_accuracy[:, -1])),
+            "ILE": float(np.median(m.error[:, -1])),
+            "success": m.breach.rate(REACHED) if m.breach else None,
+            "success interval": m.breach.interval(REACHED) if m.breach else None,
+            "time-outs": m.breach.rate(TIMED_OUT) if m.breach else None,
+            "seconds": float(np.median(m.seconds[:, -1])) if learns else None,
+            "seconds per session": float(np.median(m.seconds[:, -1]) / study.sessions) if learns else None,
+        }
+        if m.name == BATCH:
+            # Batch has no sessions: its share of one run over everything would flatter it.
+            row["seconds per session"] = float(np.median(m.seconds[:, -1]))
+        rows.append(row)
+    return rows
+
+
+def summary(study: Study) -> dict[str, Any]:
+    """The study's settings and results as plain data."""
+    reward: dict[str, Any] = {
+        "features": list(study.patrol.mdp.feature_names),
+        "true weights": study.patrol.weights,
+        "learned, first run": [
+            {"patroller": who, "method": study.methods[0].name, "weights": found.estimates.summary()}
+            for who, found in _by_patroller(study).items()
+        ],
+        "by method, run and patroller": {m.name: m.weights[:, :, -1] for m in study.methods},
+    }
+    told: dict[str, Any] = plain({
+        "provenance": study_provenance(study.seed),
+        "patrol": study.patrol.name,
+        "observability": study.observability,
+        "sessions": study.sessions,
+        "trials": study.trials,
+        "runs": study.runs,
+        "seed": study.seed,
+        "methods": _rows(study),
+        "reward": reward,
+        "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
+        "true weights": study.truth._asdict(),
+    })  # fmt: skip
+    return told
+
+
+_HEADINGS = (
+    "method",
+    "LBA",
+    "LBA, choice states",
+    "ILE",
+    "nats a trajectory",
+    "success (95 % interval)",
+    "time-outs",
+    "s / session",
+)
+
+
+def _percent(x: float | None, digits: int = 1) -> str:
+    return "-" if x is None else f"{100 * x:.{digits}f} %"
+
+
+def _results_table(study: Study) -> Table:
+    cells: list[tuple[str, ...]] = []
+    for row in _rows(study):
+        interval = row["success interval"]
+        success = _percent(row["success"])
+        if interval is not None:
+            success += f" ({100 * interval[0]:.0f}-{100 * interval[1]:.0f})"
+        cells.append((
+            row["method"], _percent(row["LBA"]), _percent(row["LBA choice states"]), f"{row['ILE']:.4f}",
+            f"{row['log-likelihood']:.3f}", success, _percent(row["time-outs"]),
+            number(row["seconds per session"]),
+        ))  # fmt: skip
+    return Table(_HEADINGS, cells, _CAPTION)
+
+
+_CAPTION = (
+    "Medians over runs and patrollers. ILE is relative to the optimal value. Nats: log-likelihood of fresh "
+    "demonstrations. Seconds: all patrollers together; for batch, those of one run over everything, spent "
+    "again at each session."
+)
+
+
+def print_tables(study: Study, console: Console) -> None:
+    """Print the results."""
+    print_page_tables([_results_table(study)], console, _settings(study))
+
+
+def _settings(study: Study) -> str:
+    told = (
+        f"{study.patrol.name}, {study.observability} % in view, {counted(study.sessions, 'session')} of "
+        f"{STEPS_PER_SESSION} steps, {counted(study.runs, 'run')}"
+    )
+    return told if study.patrol.breach is None else f"{told} of {counted(study.trials, 'breach')}"
+
+
+# -- the page -------------------------------------------------------------------------------------------
+
+
+def _by_patroller(study: Study) -> dict[str, Identifiability]:
+    names = (
+        ("the patroller",) if len(study.determined) == 1 else ("the first patroller", "the second patroller")
+    )
+    return dict(zip(names, study.determined, strict=False))
+
+
+def _lead(study: Study) -> Lead:
+    first, row = study.methods[0], _rows(study)[0]
+    if not study.determined:
+        return Lead(
+            f"Nothing was learned here: {listed([m.name for m in study.methods])} were only measured.",
+            "Trust the numbers as those of a control.",
+        )
+    whose = "the patroller's reward" if len(study.determined) == 1 else "the rewards of both patrollers"
+    learned = (
+        f"From {counted(study.sessions, 'session')} with {study.observability} % of {study.patrol.name} in "
+        f"view, {first.name} learned {whose}: the best policy of what was learned does as the expert in "
+        f"{number(100 * row['LBA'])} % of the states and loses {_lost(row['ILE'])} of the value."
+    )
+    vague = sum(len(found.directions) for found in study.determined)
+    total = sum(len(found.features) for found in study.determined)
+    weights = (
+        "and the demonstrations determine every direction of the weights"
+        if not vague
+        else f"and the demonstrations leave {'all' if vague == total else f'{vague} of the'} {total} "
+        "directions of the weights open, so trust the policy rather than single weights"
+    )
+    reach = _share_as_good(study)
+    trust = (
+        f"That accuracy is no evidence, since {_percent(reach, 0)} of random weights reach it as well; "
+        "trust the likelihood of fresh demonstrations instead, "
+        if reach > 0.05
+        else f"Chance does not explain the accuracy, since {_percent(reach, 1)} of random weights reach it, "
+    )
+    tables = [
+        found.estimates.table(
+            f"Weights of {who} that {first.name} learned in the first run. Intervals are those of the "
+            "likelihood's curvature there; a reward is known up to its length, hence the shares.",
+            np.asarray(study.patrol.weights),
+        )
+        for who, found in _by_patroller(study).items()
+    ]
+    return Lead(learned, f"{trust}{weights}.", tables)
+
+
+def _lost(error: float) -> str:
+    return "nothing" if error < 5e-7 else f"{number(100 * error)} %"
+
+
+def _share_as_good(study: Study) -> float:
+    """Share of random weights whose LBA is that of the first method, or more."""
+    return float(np.mean(study.chance >= np.median(study.methods[0].accuracy[:, -1]) - 1e-9))
+
+
+def _text(study: Study) -> str:
+    first = study.methods[0]
+    reached, median = np.median(first.accuracy[:, -1]), float(np.median(study.chance))
+    stretched, best = study.truth.best
+    learned = float(np.median(first.log_likelihood[:, -1]))
+    return f"""Settings: {_settings(study)}.
+
+Chance: of {counted(len(study.chance), "weight vector")} drawn at random, half have an LBA of at least \
+{_percent(median)}, and {_percent(_share_as_good(study))} have the {_percent(float(reached))} of \
+{first.name} or more. The row of random weights is one such draw a patroller and run.
+
+Likelihood: it is that of a policy which errs the less the longer its weights are, and the patrollers never \
+err. The true weights are given in no such units. As given they reach {number(study.truth.as_given)} nats a \
+trajectory, stretched {number(stretched)} times {number(best)}, and {first.name} {number(learned)}. Learned \
+weights maximise the likelihood of what was seen, their length included; the true weights maximise nothing, \
+so that a likelihood above theirs is no error."""
+
+
+def write(study: Study, folder: Path | str) -> Path:
+    """Write the page: ``index.html``, the pictures in both themes, and ``results.json``."""
+    first = study.methods[0]
+    policy = greedy_policies(study.patrol, first.weights[0, :1, -1])[0]
+    pictures = [
+        drawn(
+            folder, "policy", lambda theme: policy_map(
+                study.patrol, np.exp(np.asarray(policy)), study.observability, theme=theme,
+                title=f"Policy of {first.name}",
+            ),
+            "What the first patroller is believed to do in every state; tinted cells are in view.",
+            "Map of the patrol with the learned policy as arrows",
+        ),
+        drawn(
+            folder, "hidden-path", lambda theme: hidden_path(
+                study.patrol, study.stretch.posterior, study.stretch.seen, study.stretch.path, theme=theme
+            ),
+            "A stretch of patrol nobody learned from: belief about the hidden steps, given the seen ones.",
+            "Probability of each cell over time, with the true path",
+        ),
+    ]  # fmt: skip
+    learning = [m for m in study.methods if m.name not in (RANDOM, TRUE)]
+    if learning:
+        curves = [LearningCurve(m.name, m.points, m.accuracy, m.log_likelihood) for m in learning]
+        pictures.append(drawn(
+            folder, "learning", lambda theme: learning_curves(curves, theme=theme),
+            "Accuracy of the learned behaviour, and likelihood of fresh demonstrations, as sessions go by.",
+            "Accuracy and log-likelihood against sessions",
+        ))  # fmt: skip
+        pictures.append(drawn(
+            folder, "time", partial(_draw_time, study, learning),
+            "Learning time of all patrollers together, without compilation. Running batch after every "
+            f"session is summed by interpolation between the {BATCH_POINTS} points at which it was timed.",
+            "Learning time against trajectories",
+        ))  # fmt: skip
+    rates = [
+        SuccessRate(m.name, int((ended == REACHED).sum()), int((ended == TIMED_OUT).sum()), len(ended))
+        for m in study.methods
+        if m.breach is not None
+        for ended in [m.breach.ended]
+    ]
+    if rates:
+        pictures.append(drawn(
+            folder, "success", lambda theme: success_rates(rates, theme=theme),
+            "Share of simulated breaches that reached a goal unseen, and that timed out.",
+            "Success and time-out rates by method",
+        ))  # fmt: skip
+    sections = [Section("Results", _text(study), [_results_table(study)], pictures)]
+    if study.determined:
+        sections.append(identifiability_section(_by_patroller(study)))
+    title = f"What {study.patrol.name}'s patrollers want"
+    return write_page(folder, title, _lead(study), sections, summary(study))
+
+
+def _draw_time(study: Study, learning: Sequence[MethodResult], theme: Theme) -> Figure:
+    times = [
+        LearningTime(m.name if m.name != BATCH else "batch LME, one run", m.points, m.seconds)
+        for m in learning
+    ]
+    if study.batch_rerun_seconds is not None:
+        every = np.arange(1, study.sessions + 1)
+        times.append(LearningTime("batch LME, again after every session", every, study.batch_rerun_seconds))
+    return learning_time(times, theme=theme)

@@ -1,0 +1,263 @@
+"""The sorting study told: tables, figures, and the report that ``i2rl run sorting`` writes."""
+
+from __future__ import annotations
+
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import jax.numpy as jnp
+import numpy as np
+
+from ....inference.learners.mtirl import DEFAULT_RESTARTS
+from ....models.observation.demonstration import SEEN
+from ...drawing.estimates import Estimates, laplace_errors
+from ...drawing.page import Lead, Section, Table, drawn, write_page
+from ...drawing.page import print_tables as print_page_tables
+from ...drawing.results import plain, study_provenance
+from ...drawing.text import counted, listed, number
+from ...judging.multi_task import match_ways
+from ...posteriors.information import complete_information
+from . import figures
+from .study import BATCH, DPM, EM, EM_UNTOLD, FEW, METHODS, ONLINE, SortingStudy
+from .table import (
+    HEADINGS,
+    behaviours,
+    caption,
+    cells,
+    print_sorting_table,
+    sorting_table_plot,
+    sorting_table_summary,
+)
+
+# As in the posteriors of one reward.
+PRIOR_SCALE = 2.5
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+def summary(study: SortingStudy) -> dict[str, Any]:
+    """Settings and all measures as plain data."""
+    told: dict[str, Any] = plain({
+        "provenance": study_provenance(study.seed),
+        "process": study.sorting.name,
+        "tasks": study.tasks,
+        "behaviours": list(study.sorting.behaviours[: study.tasks]),
+        "ways started from": study.ways,
+        "steps": study.steps,
+        "runs": study.runs,
+        "seed": study.seed,
+        "EVD of the best single behaviour": study.one_way,
+        "online over batch, seconds": study.online_share,
+        "methods": [
+            {
+                "method": result.name,
+                "trajectories": result.trajectories.tolist(),
+                "EVD": result.measures.value_difference.tolist(),
+                "ways": result.measures.ways.tolist(),
+                "assignment accuracy": result.measures.accuracy.tolist(),
+                "adjusted Rand index": result.measures.rand.tolist(),
+                "seconds": result.measures.seconds.tolist(),
+                "weights of the first run": result.found.weights.tolist(),
+                "proportions of the first run": result.found.proportions.tolist(),
+            }
+            for result in study.results
+        ],
+        "ways of the first run": [
+            {"way": way, "weights": found.summary()} for way, found in _estimates(study).items()
+        ],
+        "table 7.2": sorting_table_summary(study.table),
+    })  # fmt: skip
+    return told
+
+
+def _estimates(study: SortingStudy) -> dict[str, Estimates]:
+    """Weights of every way that the first method found in the first run, named after what it is like.
+
+    Errors of maximum-entropy methods are those of the posterior's curvature under a normal prior of scale
+    :data:`PRIOR_SCALE`, given who did what: experts who never err leave most directions to the prior. Other
+    likelihoods have another curvature, and their weights no errors here.
+    """
+    result, mdp = study.results[0], study.sorting.mdp
+    demonstration = study.demonstration
+    behaviour_of = {way: b for b, way in match_ways(study.labels, result.found.assignments).items()}
+    seen = demonstration.kind == SEEN
+    found: dict[str, Estimates] = {}
+    for way in np.unique(result.found.assignments).tolist():
+        weights = np.asarray(result.found.weights[way])
+        errors = np.full(len(weights), np.inf)
+        if result.name in (METHODS[BATCH], METHODS[ONLINE]):
+            share = np.broadcast_to(result.found.responsibilities[:, way, None], seen.shape)
+            visits = np.bincount(demonstration.state[seen], share[seen], mdp.n_states)
+            information = complete_information(mdp, jnp.asarray(weights), jnp.asarray(visits))
+            errors = laplace_errors(np.asarray(information) + np.eye(len(weights)) / PRIOR_SCALE**2)
+        name = study.sorting.behaviours[behaviour_of[way]] if way in behaviour_of else "like no behaviour"
+        found[f"way {len(found) + 1}, {name}"] = Estimates(mdp.feature_names, weights, errors)
+    return found
+
+
+def _results_table(study: SortingStudy) -> Table:
+    rows: list[tuple[str, ...]] = []
+    for result in study.results:
+        m = result.measures
+        for t, n in enumerate(result.trajectories):
+            evd = m.value_difference[:, t]
+            rows.append((
+                result.name if t == 0 else "", f"{n}",
+                f"{number(evd.mean())} ({number(evd.min())} to {number(evd.max())})",
+                number(evd.mean() / study.steps, 2),
+                f"{np.median(m.ways[:, t]):g} ({(m.ways[:, t] == study.tasks).sum()} of {study.runs})",
+                f"{100 * m.accuracy[:, t].mean():.1f}",
+                f"{m.rand[:, t].mean():.3f}",
+                number(np.median(m.seconds[:, t])),
+            ))  # fmt: skip
+    share = study.online_share
+    online = (
+        ""
+        if share is None
+        else f" All sessions online took {100 * share:.0f} % of the time of batch at the end of each."
+    )
+    return Table(
+        ("method", "N", "EVD (all runs)", "a step", "ways (right in)", "accuracy, %", "Rand", "seconds"),
+        rows,
+        f"N: trajectories. EVD: mean of {_runs(study)}, in discounted reward a trajectory; the best "
+        f"single behaviour for all has {number(study.one_way)}. Ways: median number found. "
+        "Rand: adjusted Rand index. "
+        f"Seconds: median, without compilation; online: all sessions so far.{online}",
+    )
+
+
+def _title(study: SortingStudy) -> str:
+    names = study.sorting.behaviours[: study.tasks]
+    return f"Sorting onions in {study.tasks} ways: {listed(names)}"
+
+
+def _runs(study: SortingStudy) -> str:
+    return "one run" if study.runs == 1 else counted(study.runs, "independent run")
+
+
+def _text(study: SortingStudy) -> str:
+    sizes = ", ".join(map(str, study.counts))
+    told = {
+        METHODS[BATCH]: f"MME-MTIRL starts from {study.ways} ways and finds out how many there are.",
+        METHODS[ONLINE]: "Online MME-MTIRL sees every trajectory in one session only and keeps none; it is "
+        "judged on all trajectories so far, each assigned by what it knows now.",
+        METHODS[DPM]: "DPM-BIRL may find as many ways as there are trajectories.",
+        METHODS[EM]: f"EM-MLIRL is given the true number of ways and has {DEFAULT_RESTARTS} starts.",
+        METHODS[EM_UNTOLD]: f"EM-MLIRL that is not told is given {study.ways}, and as many starts.",
+    }
+    methods = " ".join(told[result.name] for result in study.results)
+    return f"""Sorters act optimally for one of {study.tasks} rewards; their trajectories of {study.steps} \
+steps come in one jumble. Learned from: {sizes} trajectories, the same for every method, in {_runs(study)}. \
+{methods} A way counts as found if it is the likeliest of some trajectory.
+
+EVD compares greedy policies, so a reward that is wrong in many ways may lose exactly \
+nothing. Not all mistakes cost the same: where there is no list, the best roller picks as the picker does, \
+so taking a picker for a roller costs its first steps only.
+
+{_scope(study)}"""
+
+
+def _scope(study: SortingStudy) -> str:
+    """What the numbers of trajectories leave open; empty if nothing."""
+    told = []
+    if tuple(study.counts) == FEW[study.tasks]:
+        told.append(
+            "These are few numbers of trajectories, since every method is compiled for each; the "
+            "dissertation's design is `--trajectories all --runs 10`."
+        )
+    if study.counts[0] < study.ways:
+        told.append(
+            f"From {counted(int(study.counts[0]), 'trajectory')} no more than {study.counts[0]} of the "
+            f"{study.ways} ways started from can be found."
+        )
+    return " ".join(told)
+
+
+def _sorting_tables(study: SortingStudy) -> list[Table]:
+    """Table 7.2, a table a behaviour."""
+    return [
+        Table(HEADINGS, cells(study.table, behaviour), f"Table 7.2, {behaviour}. {caption(study.table)}")
+        for behaviour in behaviours(study.table)
+    ]
+
+
+def print_tables(study: SortingStudy, console: Console) -> None:
+    """Print the results and Table 7.2."""
+    print_page_tables([_results_table(study)], console, f"{_title(study)}. {_scope(study)}")
+    print_sorting_table(study.table, console)
+
+
+def _lead(study: SortingStudy) -> Lead:
+    result = study.results[0]
+    m, n = result.measures, int(result.trajectories[-1])
+    right, lost = int((m.ways[:, -1] == study.tasks).sum()), float(m.value_difference[:, -1].mean())
+    found = f"{float(np.median(m.ways[:, -1])):g}"
+    learned = (
+        f"From one jumble of {counted(n, 'trajectory')} {result.name} learned {found} ways of sorting, where "
+        f"{study.tasks} were demonstrated, put {number(100 * float(m.accuracy[:, -1].mean()))} % of the "
+        f"trajectories in the right one, and loses {number(lost)} of the value, where one way for all "
+        f"loses {number(study.one_way)}."
+    )
+    known = right == study.runs and lost < 0.1 * study.one_way
+    spread = "one run shows no spread" if study.runs == 1 else f"so it was in {right} of {study.runs} runs"
+    trust = (
+        f"Trust the ways and what they do ({spread}); the weights of experts who never err have no scale of "
+        "their own, so trust their signs where an interval leaves zero out."
+        if known
+        else "Do not trust it as it is: the true number was found in "
+        f"{right} of {counted(study.runs, 'run')}, and more trajectories may be needed."
+    )
+    tables = [
+        estimates.table(
+            f"Weights of {way}, that {result.name} found in the first run. "
+            + (
+                "Intervals are those of the posterior's curvature under a normal prior of scale "
+                f"{PRIOR_SCALE}, given who did what; one of plus and minus {number(1.96 * PRIOR_SCALE, 2)} "
+                "says no more than the prior."
+                if np.isfinite(estimates.errors).any()
+                else "No intervals are computed for its likelihood."
+            )
+        )
+        for way, estimates in _estimates(study).items()
+    ]
+    return Lead(learned, trust, tables)
+
+
+def write(study: SortingStudy, folder: Path | str) -> Path:
+    """Write the page: ``index.html``, the pictures in both themes, and ``results.json``."""
+    pictures = [
+        drawn(folder, name, draw, told, description)
+        for name, draw, told, description in (
+            ("clusters", partial(figures.clusters_plot, study),
+             "All trajectories of the first run by what they count: which way each was done, and which it "
+             "was found to be.",
+             "Scatter plots of trajectories' feature counts on two principal components, one a method"),
+            ("ways", partial(figures.ways_diagram, study),
+             "What a sorter does who follows each way that was found.",
+             "State diagrams of each way found: where the onion is, what is thought of it, and what is done"),
+            ("evd", partial(figures.evd_plot, study),
+             "Value lost by acting as was learned (Figure 7.8).",
+             "Expected value difference against trajectories for each method, with the spread over runs"),
+            ("number", partial(figures.ways_found_plot, study),
+             "How many ways were found.",
+             "Number of ways found against trajectories, one panel a method, the true number marked"),
+            ("time", partial(figures.time_plot, study),
+             "Seconds of learning, compilation left out.",
+             "Learning time against trajectories on logarithmic scales"),
+            ("table", lambda theme: sorting_table_plot(study.table, theme=theme, title="Table 7.2"),
+             "Table 7.2: what the learned ways do on simulated belts, beside the dissertation's belt.",
+             "Precision and recall of every method for both behaviours"),
+        )
+    ]  # fmt: skip
+    learned = Section("Found in the jumble", _text(study), [_results_table(study)], pictures[:-1])
+    sorted_ = Section(
+        "Sorting as was learned",
+        f"The weights that each method learned from all {counted(int(study.counts[-1]), 'trajectory')} of "
+        "the first run, each way matched with the behaviour it shares most trajectories with. A behaviour "
+        "for which no way was left is carried out as the way that most of its trajectories were put in.",
+        _sorting_tables(study),
+        pictures[-1:],
+    )
+    return write_page(folder, _title(study), _lead(study), [learned, sorted_], summary(study))

@@ -1,0 +1,122 @@
+"""Perception that takes pairs for other pairs: an observation model that also injects its errors."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ...models.inputs.arguments import concrete, is_traced, rebuilt_unchecked
+from ...models.observation.evidence import Imperfection, ObservationModel, Sensor
+
+
+class _SwapFields(NamedTuple):
+    swaps: Int[Array, "M S A"]
+    noise: Float[Array, " M"]
+
+
+@rebuilt_unchecked
+class SwapNoise(_SwapFields):
+    """Confusions that happen independently of each other: the report is the truth with some swaps applied.
+
+    Parameters
+    ----------
+    swaps : int ``[M, S, A]``
+        What each confusion takes a pair for, as the flat index ``s * A + a``; the pair itself where it has
+        nothing to confuse. Each is its own inverse, their order does not matter, and different ones applied
+        to a pair give different reports.
+    noise : float ``[M]``
+        Probability of each, where it has something to confuse.
+
+    Raises
+    ------
+    ValueError
+        For probabilities outside [0, 1], or swaps that are not as above.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, swaps: np.ndarray | Array, noise: np.ndarray | Array) -> SwapNoise:
+        """Check and convert; see the class."""
+        flat = jnp.asarray(swaps if is_traced(swaps) else _checked_swaps(np.asarray(swaps)))
+        p = concrete("noise", noise)
+        if p is not None:
+            if p.shape != flat.shape[:1]:
+                raise ValueError(
+                    f"{flat.shape[0]} swaps need as many probabilities of noise, got shape {list(p.shape)}"
+                )
+            for m in np.flatnonzero(~((p >= 0) & (p <= 1))):
+                raise ValueError(
+                    f"the noise of a swap is a probability in [0, 1]; that of swap {m} is {p[m]}"
+                )
+        return super().__new__(cls, flat, jnp.asarray(noise if p is None else p, float))
+
+    def __mul__(self, other: Imperfection) -> Sensor:  # type: ignore[override]
+        """Compose with another imperfection, such as a :class:`Visibility`."""
+        return self.reading * other
+
+    @property
+    def presence(self) -> None:
+        """Noise hides nothing."""
+        return None
+
+    @property
+    def acts(self) -> Bool[Array, "M S A"]:
+        """Where each swap has something to confuse."""
+        return self.swaps != jnp.arange(self.swaps[0].size).reshape(self.swaps.shape[1:])
+
+    @property
+    def reading(self) -> ObservationModel:
+        """``O(o | g)``: the report is the truth with a random subset of the swaps applied."""
+        shape, (m, size) = self.swaps.shape[1:], self.swaps.reshape(len(self.noise), -1).shape
+        chosen = _subsets(m)
+        weights = jnp.prod(jnp.where(chosen, self.noise, 1 - self.noise), axis=1)
+        table = jnp.zeros((size, size))
+        for weight, report in zip(weights, self._reports(), strict=True):
+            table = table.at[jnp.arange(size), report].add(weight)
+        return ObservationModel._make((jnp.log(table).reshape(*shape, *shape),))
+
+    def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
+        """Which swaps turned each truth into its report (flat indices); none where no swaps do."""
+        # The first subset that explains a report holds no swap without effect.
+        return jnp.asarray(_subsets(len(self.noise)))[(self._reports()[:, truth] == report).argmax(0)]
+
+    def _reports(self) -> Int[Array, "2**M S*A"]:
+        flat = self.swaps.reshape(len(self.noise), -1)
+        reports = []
+        for subset in _subsets(len(self.noise)):
+            report = jnp.arange(flat.shape[1])
+            for m in np.flatnonzero(subset):
+                report = flat[m][report]
+            reports.append(report)
+        return jnp.stack(reports)
+
+
+def _subsets(m: int) -> Bool[np.ndarray, "2**M M"]:
+    return (np.arange(2**m)[:, None] >> np.arange(m)) % 2 == 1
+
+
+def _checked_swaps(swaps: np.ndarray) -> Int[np.ndarray, "M S A"]:
+    if swaps.ndim != 3 or not swaps.size or not np.issubdtype(swaps.dtype, np.integer):
+        raise ValueError(
+            f"swaps are whole numbers of shape [M, S, A], got {swaps.dtype} of {list(swaps.shape)}"
+        )
+    flat = swaps.reshape(len(swaps), -1)
+    pairs = np.arange(flat.shape[1])
+    if flat.min() < 0 or flat.max() >= len(pairs):
+        raise ValueError(f"swaps name pairs by their flat index, 0 to {len(pairs) - 1}; got {flat.max()}")
+    for m, swap in enumerate(flat):
+        if (swap[swap] != pairs).any():
+            g = int(np.flatnonzero(swap[swap] != pairs)[0])
+            raise ValueError(
+                f"swap {m} takes pair {g} for {swap[g]}, but {swap[g]} for {swap[swap[g]]}, not {g}"
+            )
+        for n in range(m):
+            other = flat[n]
+            if (swap[other] != other[swap]).any():
+                raise ValueError(f"swaps {n} and {m} give different reports in different order")
+            if ((swap == other) & (swap != pairs)).any():
+                raise ValueError(f"swaps {n} and {m} take a pair for the same other pair")
+    return swaps

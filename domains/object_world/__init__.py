@@ -1,0 +1,4 @@
+"""Object World: a walled grid with two objects.
+
+Imports :mod:`i2rl.domains.gym`.
+"""

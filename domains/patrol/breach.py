@@ -1,0 +1,274 @@
+"""Breaching a patrol (section 7.1.1): where the patrollers will be, and a way to the goal they do not see.
+
+The learner keeps a belief about where each patroller is, predicts where they will be under the policies it
+learned, and plans a way to the goal. What the dissertation leaves open (rewards, horizon, start) follows the
+reconstruction that :class:`BreachSettings` states. Runs of the whole task: :mod:`i2rl.domains.patrol.trials`.
+
+A patroller sees the cells within ``reach`` (Euclidean) straight ahead of it, its own included; walls do not
+matter, as in the released code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ...models.laws.chain import condition
+from ...models.observation.demonstration import HIDDEN, LOST
+from ...models.observation.evidence import Imperfection, step_log_evidence
+from ...models.process.mdp import TabularMDP
+from .process import Breach, Interaction, Patrol, _ahead, _simulate
+
+MOVES = ("forward", "left", "right")
+
+
+class BreachSettings(NamedTuple):
+    """The learner's task in numbers; none is published, so all are reconstructions.
+
+    ``reward`` is paid at a goal, ``penalty`` when caught; with probability ``failure`` one of the other two
+    actions happens instead; a plan covers ``horizon`` steps; patrollers see ``reach`` cells ahead; the
+    learner may wait for ``rounds`` rounds of the patrol.
+    """
+
+    reward: float = 10.0
+    penalty: float = 10.0
+    failure: float = 0.05
+    horizon: int = 60
+    reach: float = 3.0
+    rounds: float = 2.0
+
+
+class BreachTask(NamedTuple):
+    """The learner's process without time, over ``X`` states (cell, heading) of its ``C`` cells.
+
+    Fields
+    ------
+    following : int ``[X, 3]``
+        State each move intends; a blocked move stays.
+    cell : int ``[X]``
+        Index of the state's cell in ``patrol.breach.cells``.
+    goal : bool ``[X]``
+    start : int
+    sees : float ``[C, S]``
+        1 where a patroller in state ``s`` sees cell ``c``.
+    discount : float
+    """
+
+    following: Int[Array, "X 3"]
+    cell: Int[Array, " X"]
+    goal: Bool[Array, " X"]
+    start: Int[Array, ""]
+    sees: Float[Array, "C S"]
+    discount: Float[Array, ""]
+
+
+class BreachPlan(NamedTuple):
+    """Optimal values ``[T, X]`` at each step of the plan, and the best move (index into ``MOVES``)."""
+
+    values: Float[Array, "T X"]
+    moves: Int[Array, "T X"]
+
+
+def line_of_sight(patrol: Patrol, reach: float) -> Bool[np.ndarray, "C S"]:
+    """Which patroller states see which of the learner's cells."""
+    breach = _breach_of(patrol)
+    down, right = (
+        np.array(breach.cells)[:, axis, None] - np.array([state.cell[axis] for state in patrol.states])
+        for axis in (0, 1)
+    )
+    heading = np.array([state.heading for state in patrol.states])
+    east, north, west, south = (heading == h for h in range(4))
+    row, column = down == 0, right == 0
+    ahead = (
+        (east & row & (right >= 0)) | (west & row & (right <= 0))
+        | (north & column & (down <= 0)) | (south & column & (down >= 0))
+    )  # fmt: skip
+    return ahead & (np.hypot(down, right) <= reach)
+
+
+def breach_task(patrol: Patrol, reach: float = 3.0) -> BreachTask:
+    """The learner's process on a patrol's map; ``ValueError`` for an instance without such a task."""
+    breach = _breach_of(patrol)
+    index = {cell: i for i, cell in enumerate(breach.cells)}
+    states = [breach.start._replace(row=r, column=c, heading=h) for r, c in breach.cells for h in range(4)]
+    following = []
+    for state in states:
+        cell = _ahead(state) if _ahead(state) in index else state.cell
+        turns = ((state.heading + 1) % 4, (state.heading - 1) % 4)
+        at = index[state.cell] * 4
+        following.append((index[cell] * 4 + state.heading, at + turns[0], at + turns[1]))
+    return BreachTask(
+        jnp.array(following),
+        jnp.arange(len(states)) // 4,
+        jnp.array([state.cell in breach.goals for state in states]),
+        jnp.array(states.index(breach.start)),
+        jnp.asarray(line_of_sight(patrol, reach), float),
+        jnp.array(breach.discount),
+    )
+
+
+def _breach_of(patrol: Patrol) -> Breach:
+    if patrol.breach is None:
+        raise ValueError(f"{patrol.name} has no breach: the learner of that instance only watches")
+    return patrol.breach
+
+
+# -- where the patrollers are, and where they will be -------------------------------------------------
+
+
+def watch(
+    mdp: TabularMDP,
+    log_policy: Float[Array, "S A"],
+    sensor: Imperfection,
+    belief: Float[Array, " S"],
+    code: Int[Array, " 3"],
+) -> Float[Array, " S"]:
+    """One step of the exact filter: the belief about the next state after perceiving ``code`` of this one.
+
+    ``code`` is (kind, state, action) as in :attr:`Demonstration.codes`. Not being seen counts as evidence.
+    What policy and belief rule out, perception overrules: after a pair seen, the belief is the dynamics' own;
+    after a hidden step that was believed impossible, it starts afresh from anywhere out of view.
+    """
+    kind, state, action = code[0], code[1], code[2]
+    no_score = jnp.array(jnp.nan)
+    evidence = step_log_evidence(sensor, mdp.n_states, mdp.n_actions, kind, state, action, no_score)
+    factors = evidence + log_policy
+    possible = jnp.any((belief[:, None] > 0) & (factors > -jnp.inf))
+    belief = jnp.where(possible, belief, 1 / mdp.n_states)
+    factors = jnp.where(possible, factors, evidence)
+    return condition(mdp, belief, factors)
+
+
+def project(
+    mdp: TabularMDP,
+    log_policy: Float[Array, "S A"],
+    sensor: Imperfection,
+    belief: Float[Array, " S"],
+    code: Int[Array, " 3"],
+) -> Float[Array, " S"]:
+    """The dissertation's belief: propagation from the last sighting, as if nobody had looked since.
+
+    As :func:`watch`, but a hidden step is taken for a lost frame.
+    """
+    kind = jnp.where(code[0] == HIDDEN, LOST, code[0])
+    return watch(mdp, log_policy, sensor, belief, code.at[0].set(kind))
+
+
+Watcher = Callable[
+    [TabularMDP, Float[Array, "S A"], Imperfection, Float[Array, " S"], Int[Array, " 3"]], Float[Array, " S"]
+]
+
+
+def current_beliefs(
+    mdp: TabularMDP,
+    log_policies: Float[Array, "P S A"],
+    sensor: Imperfection,
+    codes: Int[Array, "P L 3"],
+    watcher: Watcher = watch,
+) -> Float[Array, "P S"]:
+    """Belief about each patroller's state after the ``L`` steps perceived of it, from ``mdp.initial`` on."""
+
+    def one(log_policy: Float[Array, "S A"], codes: Int[Array, "L 3"]) -> Float[Array, " S"]:
+        def step(belief: Float[Array, " S"], code: Int[Array, " 3"]) -> tuple:
+            return watcher(mdp, log_policy, sensor, belief, code), None
+
+        return lax.scan(step, mdp.initial, codes)[0]
+
+    return jax.vmap(one)(log_policies, jnp.asarray(codes))
+
+
+class IndependentForecast(NamedTuple):
+    """Exact marginals of each patroller walking alone; their meetings are left out (the default)."""
+
+    def __call__(
+        self,
+        key: Array,
+        mdp: TabularMDP,
+        cells: Int[Array, " S"],
+        log_policies: Float[Array, "P S A"],
+        beliefs: Float[Array, "P S"],
+        horizon: int,
+    ) -> Float[Array, "P T S"]:
+        """``P(s_t)`` of each patroller for ``t = 0..horizon-1``; step 0 is the belief itself."""
+        del key, cells
+        chains = jax.vmap(mdp.state_transitions)(jnp.exp(log_policies))
+
+        def step(beliefs: Float[Array, "P S"], _: None) -> tuple:
+            return jnp.einsum("ps,psz->pz", beliefs, chains), beliefs
+
+        marginals: Array = lax.scan(step, beliefs, None, horizon)[1]
+        return jnp.swapaxes(marginals, 0, 1)
+
+
+class SimulatedForecast(NamedTuple):
+    """Marginals estimated from joint simulations, meetings included (what the released code ships)."""
+
+    interaction: Interaction = Interaction()
+    draws: int = 300
+
+    def __call__(
+        self,
+        key: Array,
+        mdp: TabularMDP,
+        cells: Int[Array, " S"],
+        log_policies: Float[Array, "P S A"],
+        beliefs: Float[Array, "P S"],
+        horizon: int,
+    ) -> Float[Array, "P T S"]:
+        """As for :class:`IndependentForecast`, from ``draws`` walks that start from the beliefs."""
+        equilibrium, length = self.interaction
+
+        def one(key: Array) -> Int[Array, "P T"]:
+            begin, walk = jax.random.split(key)
+            start = jax.random.categorical(begin, jnp.log(beliefs))
+            return _simulate(walk, mdp, cells, log_policies, start, equilibrium, length, horizon)[0]
+
+        states = jax.vmap(one)(jax.random.split(key, self.draws))
+        patroller, time = np.ogrid[: beliefs.shape[0], :horizon]
+        empty = jnp.zeros((beliefs.shape[0], horizon, mdp.n_states))
+        return empty.at[patroller, time, states].add(1 / self.draws)
+
+
+Forecast = IndependentForecast | SimulatedForecast
+
+
+def detection_probability(sees: Float[Array, "C S"], marginals: Float[Array, "P T S"]) -> Float[Array, "T C"]:
+    """``1 - prod_i (1 - d_i)``: that some patroller sees the cell at that step, taken as independent."""
+    return 1 - jnp.prod(1 - jnp.einsum("cs,pts->ptc", sees, marginals), axis=0)
+
+
+# -- planning -----------------------------------------------------------------------------------------
+
+
+def plan_breach(task: BreachTask, detection: Float[Array, "T C"], settings: BreachSettings) -> BreachPlan:
+    """Optimal plan against predicted patrollers, exact by one backward sweep.
+
+    At each step the learner is first detected, with the probability ``detection [T, C]`` gives for its cell
+    (it is caught and pays the penalty), and otherwise moves. A goal ends the run and pays the reward; the
+    last step pays nothing.
+    """
+    goal_value = jnp.where(task.goal, settings.reward, 0.0)
+
+    def back(values: Float[Array, " X"], detected: Float[Array, " C"]) -> tuple:
+        onward = _expected_values(task, values, settings.failure)
+        caught = detected[task.cell][:, None]
+        q = task.discount * ((1 - caught) * onward - caught * settings.penalty)
+        values = jnp.where(task.goal, goal_value, jnp.max(q, axis=1))
+        return values, (values, jnp.argmax(q, axis=1))
+
+    last = jnp.zeros(task.goal.shape)
+    swept: tuple = lax.scan(back, last, detection[:-1], reverse=True)[1]
+    values, moves = swept
+    return BreachPlan(jnp.concatenate([values, last[None]]), jnp.pad(moves, ((0, 1), (0, 0))))
+
+
+def _expected_values(task: BreachTask, values: Float[Array, " X"], failure: float) -> Float[Array, "X 3"]:
+    intended = values[task.following]
+    others = (jnp.sum(intended, axis=1, keepdims=True) - intended) / 2
+    return (1 - failure) * intended + failure * others

@@ -1,0 +1,435 @@
+"""Perimeter patrol (section 7.1.1, appendix C): robots walk hallways in loops, watched through a keyhole.
+
+Three instances on grids, each a reconstruction from the dissertation and its authors' released code where
+the two are silent or disagree (said at each place). Cells are ``(row, column)``, rows grow southward. A
+patroller's state is a cell and a heading (and, in instance 1, the hallway whose end it visited last); it
+moves forward, turns left or right, or stops. The intended move succeeds with a fixed probability,
+otherwise nothing changes; one step takes two seconds.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache, partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ...models.observation.demonstration import Demonstration
+from ...models.observation.evidence import Visibility, observe
+from ...models.process.mdp import TabularMDP
+from ...models.process.planning import hard_plan, reward_of
+
+Cell = tuple[int, int]
+
+ACTIONS = ("forward", "left", "right", "stop")
+FORWARD, LEFT, RIGHT, STOP = range(4)
+HEADINGS = ("east", "north", "west", "south")
+_STEP = ((0, 1), (-1, 0), (0, -1), (1, 0))
+SECONDS_PER_STEP = 2.0
+# The released solver breaks every tie between turns to the right.
+_TIE_ORDER = (FORWARD, RIGHT, LEFT, STOP)
+
+
+class State(NamedTuple):
+    """A patroller's state; ``phase`` is 0 except in instance 1."""
+
+    row: int
+    column: int
+    heading: int
+    phase: int = 0
+
+    @property
+    def cell(self) -> Cell:
+        """The cell it stands on."""
+        return self.row, self.column
+
+    @property
+    def name(self) -> str:
+        """For example ``(0,5) east``, or ``(0,5) east from 2`` in instance 1."""
+        phase = f" from {self.phase}" if self.phase else ""
+        return f"({self.row},{self.column}) {HEADINGS[self.heading]}{phase}"
+
+
+class Breach(NamedTuple):
+    """Where the learner starts, which way it faces, where it wants to go, and the cells it may use."""
+
+    cells: tuple[Cell, ...]
+    start: State
+    goals: tuple[Cell, ...]
+    discount: float
+
+
+class Patrol(NamedTuple):
+    """A patrolling domain.
+
+    ``mdp`` is the patrollers' process without the reward, ``weights`` the reward they really follow,
+    ``views`` the learner's view at each degree of observability (percent, as the dissertation names it),
+    ``breach`` the learner's own task (None in instance 1), ``loop`` the length of the patrollers' cycle in
+    steps, ``observability`` the degree of the dissertation's experiments.
+    """
+
+    name: str
+    mdp: TabularMDP
+    weights: Float[np.ndarray, " K"]
+    states: tuple[State, ...]
+    patrollers: int
+    views: dict[int, Bool[np.ndarray, " S"]]
+    breach: Breach | None
+    loop: int
+    observability: int = 30
+
+    @property
+    def cells(self) -> tuple[Cell, ...]:
+        """The cells patrollers can stand on, in reading order."""
+        return tuple(sorted({state.cell for state in self.states}))
+
+    @property
+    def cell_of_state(self) -> Int[np.ndarray, " S"]:
+        """Index into :attr:`cells` of each state."""
+        index = {cell: i for i, cell in enumerate(self.cells)}
+        return np.array([index[state.cell] for state in self.states])
+
+    def visibility(self, observability: int | None = None) -> Visibility:
+        """The learner's view at an observability named by the dissertation (30, 70, 100 percent, ...).
+
+        The default is the instance's own. Raises ``ValueError`` naming the degrees this instance has.
+        """
+        if observability is None:
+            observability = self.observability
+        if observability not in self.views:
+            raise ValueError(f"{self.name} has no {observability} % view; it has {sorted(self.views)}")
+        return Visibility(self.views[observability])
+
+    def expert_policy(self) -> Float[np.ndarray, "S A"]:
+        """The patrollers' optimal policy; ties go right before left, as in the released code."""
+        return greedy_policy(self.mdp, self.weights)
+
+
+def greedy_policy(mdp: TabularMDP, weights: Float[np.ndarray, " K"]) -> Float[np.ndarray, "S A"]:
+    """The deterministic policy that is optimal under some weights, ties broken by :func:`break_ties`."""
+    return break_ties(np.asarray(_optimal(mdp, jnp.asarray(weights, float))))
+
+
+@jax.jit
+def _optimal(mdp: TabularMDP, weights: Float[Array, " K"]) -> Bool[Array, "S A"]:
+    return hard_plan(mdp, reward_of(mdp, weights)).optimal
+
+
+def break_ties(optimal: Bool[np.ndarray, "S A"]) -> Float[np.ndarray, "S A"]:
+    """One optimal action per state, in the order forward, right, left, stop."""
+    order = np.array(_TIE_ORDER)
+    chosen = order[np.argmax(optimal[:, order], axis=1)]
+    return np.eye(len(ACTIONS))[chosen]
+
+
+class Interaction(NamedTuple):
+    """What two patrollers do when they meet: an equilibrium of the passing game, played for some steps.
+
+    ``equilibrium`` holds each patroller's action; forward means to follow its own policy. In the steps
+    before the last of ``length`` both wait. ``length`` 0 means they pass through each other.
+    """
+
+    equilibrium: tuple[int, int] = (STOP, FORWARD)
+    length: int = 1
+
+
+def simulate_patrol(
+    key: Array,
+    patrol: Patrol,
+    log_policies: Float[Array, "P S A"],
+    start: Int[Array, " P"],
+    steps: int,
+    interaction: Interaction = Interaction(),  # noqa: B008 (immutable)
+) -> tuple[Int[Array, "P T"], Int[Array, "P T"]]:
+    """States and actions of all patrollers over ``steps``, passing each other by the interaction's rule.
+
+    Two patrollers meet when they share a cell or one stands where the other just was. A waiting patroller
+    is recorded as stopping.
+    """
+    cells = jnp.asarray(patrol.cell_of_state)
+    return _simulate(
+        key, patrol.mdp, cells, jnp.asarray(log_policies), jnp.asarray(start), interaction.equilibrium,
+        interaction.length, steps,
+    )  # fmt: skip
+
+
+@partial(jax.jit, static_argnums=(5, 6, 7))
+def _simulate(
+    key: Array,
+    mdp: TabularMDP,
+    cells: Int[Array, " S"],
+    log_policies: Float[Array, "P S A"],
+    start: Int[Array, " P"],
+    equilibrium: tuple[int, int],
+    length: int,
+    steps: int,
+) -> tuple[Int[Array, "P T"], Int[Array, "P T"]]:
+    patrollers = log_policies.shape[0]
+    side = jnp.asarray(equilibrium[:patrollers] if patrollers > 1 else (FORWARD,))
+
+    def step(carry: tuple, key: Array) -> tuple:
+        states, before, counter = carry
+        here = cells[states]
+        if patrollers == 2:
+            meet = (here[0] == here[1]) | (before[0] == here[1]) | (before[1] == here[0])
+            counter = jnp.where((counter <= 0) & meet, length, counter)
+        act, move = jax.random.split(key)
+        own = jax.vmap(lambda k, s, p: jax.random.categorical(k, p[s]))(
+            jax.random.split(act, patrollers), states, log_policies
+        )
+        agreed = jnp.where(side == FORWARD, own, side)
+        action = jnp.where(counter > 1, STOP, jnp.where(counter == 1, agreed, own))
+        branch = jax.vmap(lambda k, s, a: jax.random.categorical(k, jnp.log(mdp.probabilities[s, a])))(
+            jax.random.split(move, patrollers), states, action
+        )
+        following = mdp.successors[states, action, branch]
+        return (following, here, counter - 1), (states, action)
+
+    begin = (jnp.asarray(start, mdp.successors.dtype), jnp.full(patrollers, -1), jnp.array(0))
+    walked: tuple = lax.scan(step, begin, jax.random.split(key, steps))[1]
+    states, actions = walked
+    return states.T, actions.T
+
+
+def demonstrate(
+    key: Array,
+    patrol: Patrol,
+    observability: int | None,
+    sessions: int,
+    steps: int = 5,
+    interaction: Interaction = Interaction(),  # noqa: B008 (immutable)
+) -> tuple[Demonstration, ...]:
+    """What the learner perceives of each patroller: ``sessions`` consecutive windows of ``steps`` pairs.
+
+    The patrollers start in states drawn from the MDP's initial distribution and follow their optimal
+    policies. Row ``i`` of each demonstration is session ``i`` (section 7.4.1: five pairs a session). An
+    ``observability`` of None is the instance's own.
+    """
+    policy = jnp.log(jnp.asarray(patrol.expert_policy()))
+    first, walk, look = jax.random.split(key, 3)
+    start = jax.random.categorical(first, jnp.log(patrol.mdp.initial), shape=(patrol.patrollers,))
+    policies = jnp.broadcast_to(policy, (patrol.patrollers, *policy.shape))
+    states, actions = simulate_patrol(walk, patrol, policies, start, sessions * steps, interaction)
+    view = patrol.visibility(observability)
+    keys = jax.random.split(look, patrol.patrollers)
+    return tuple(
+        Demonstration.from_codes(np.asarray(observe(k, view, s, a)).reshape(sessions, steps, 3))
+        for k, s, a in zip(keys, states, actions, strict=True)
+    )
+
+
+# -- the three instances ------------------------------------------------------------------------------
+
+
+def _build(
+    name: str,
+    states: tuple[State, ...],
+    intend: Callable[[State, int], State],
+    features: Callable[[State, int, State], tuple[bool, ...]],
+    feature_names: tuple[str, ...],
+    weights: tuple[float, ...],
+    *,
+    success: float,
+    discount: float,
+    patrollers: int,
+    views: dict[int, Callable[[State], bool]],
+    breach: Breach | None,
+    loop: int,
+    observability: int = 30,
+) -> Patrol:
+    index = {state: i for i, state in enumerate(states)}
+    shape = (len(states), len(ACTIONS))
+    successors = np.zeros((*shape, 2), int)
+    probabilities = np.zeros((*shape, 2))
+    phi = np.zeros((*shape, len(feature_names)))
+    for i, state in enumerate(states):
+        for a in range(len(ACTIONS)):
+            target = intend(state, a)
+            # A blocked or idle action stays with certainty; otherwise failure means staying.
+            p = 1.0 if target == state else success
+            successors[i, a] = index[target], i
+            probabilities[i, a] = p, 1 - p
+            phi[i, a] = features(state, a, target)
+    mdp = TabularMDP.from_successors(
+        successors,
+        probabilities,
+        phi,
+        discount=discount,
+        states=[state.name for state in states],
+        actions=ACTIONS,
+        feature_names=feature_names,
+    )
+    masks = {percent: np.array([rule(s) for s in states]) for percent, rule in views.items()}
+    return Patrol(name, mdp, np.array(weights), states, patrollers, masks, breach, loop, observability)
+
+
+def _ahead(state: State) -> Cell:
+    down, across = _STEP[state.heading]
+    return state.row + down, state.column + across
+
+
+def _walk(cells: frozenset[Cell]) -> Callable[[State, int], State]:
+    def intend(state: State, action: int) -> State:
+        if action == LEFT:
+            return state._replace(heading=(state.heading + 1) % 4)
+        if action == RIGHT:
+            return state._replace(heading=(state.heading - 1) % 4)
+        if action == FORWARD and _ahead(state) in cells:
+            row, column = _ahead(state)
+            return state._replace(row=row, column=column)
+        return state
+
+    return intend
+
+
+def _grid_states(cells: frozenset[Cell]) -> tuple[State, ...]:
+    return tuple(State(r, c, h) for r, c in sorted(cells) for h in range(4))
+
+
+@cache
+def four_hallways() -> Patrol:
+    """Instance 1: one patroller visits the ends of four hallways in turn (192 states).
+
+    The released map has 200 states; this reconstruction shortens its corridor by one cell, which gives the
+    192 of the dissertation (25 cells in four phases of 13, 11, 13 and 11). A feature fires on the step that
+    lands on the end of the next hallway, as appendix C's list defines it.
+    """
+    corridor = [(r, 4) for r in range(9)]
+    rows = {1: 5, 2: 0, 3: 3, 4: 8}
+    ends = {1: (5, 0), 2: (0, 8), 3: (3, 8), 4: (8, 0)}
+
+    def hallway(g: int) -> list[Cell]:
+        return [(rows[g], c) for c in (range(4) if g in (1, 4) else range(5, 9))]
+
+    legal: dict[int, frozenset[Cell]] = {}
+    for g in range(1, 5):
+        target = g % 4 + 1
+        low, high = sorted((rows[g], rows[target]))
+        passage = [cell for cell in corridor if low <= cell[0] <= high]
+        legal[g] = frozenset(hallway(g) + passage + hallway(target)) - {ends[target]}
+    states = tuple(State(r, c, h, g) for g in range(1, 5) for r, c in sorted(legal[g]) for h in range(4))
+
+    def intend(state: State, action: int) -> State:
+        target = state.phase % 4 + 1
+        if action == FORWARD and _ahead(state) == ends[target]:
+            return State(*ends[target], state.heading, target)
+        return _walk(legal[state.phase])(state, action)
+
+    def features(state: State, action: int, target: State) -> tuple[bool, ...]:
+        return tuple(target.phase == k != state.phase for k in range(1, 5))
+
+    return _build(
+        "patrol1", states, intend, features, tuple(f"switch to hallway {k}" for k in range(1, 5)),
+        (0.25, 0.25, 0.25, 0.25), success=0.99, discount=0.995, patrollers=1,
+        views={30: lambda s: s.column == 4 and s.row >= 3, 44: lambda s: s.column == 4, 100: lambda s: True},
+        breach=None, loop=64,
+    )  # fmt: skip
+
+
+@cache
+def boyd_fifth_floor() -> Patrol:
+    """Instance 2: two patrollers in a hallway with a short arm at either end (124 states).
+
+    The intended move succeeds with probability 0.95. Turning features overlap as in the released code:
+    cells (1,1) and (15,1) belong to hallway and corner, (0,2) and (16,2) to corner and first division.
+    """
+    cells = frozenset(
+        [(0, c) for c in range(1, 9)] + [(r, 1) for r in range(1, 16)] + [(16, c) for c in range(1, 9)]
+    )
+
+    def features(state: State, action: int, target: State) -> tuple[bool, ...]:
+        r, c = state.cell
+        turn = action in (LEFT, RIGHT)
+        arm = r in (0, 16)
+        return (
+            target.cell != state.cell,
+            turn and 1 <= r <= 15,
+            turn and (r <= 1 or r >= 15) and c <= 2,
+            turn and arm and 2 <= c <= 3,
+            turn and arm and 4 <= c <= 5,
+            turn and arm and c >= 6,
+        )
+
+    views: dict[int, Callable[[State], bool]] = {
+        11: lambda s: s.row == 0 and s.column <= 2,
+        18: lambda s: s.row == 0 and s.column <= 4,
+        30: lambda s: s.row <= 2 and s.column <= 6,
+        41: lambda s: s.row <= 5,
+        70: lambda s: s.row <= 14,
+        100: lambda s: True,
+    }
+    return _build(
+        "patrol2", _grid_states(cells), _walk(cells), features,
+        ("moves", "turns in hallway", "turns at corner", "turns in division 1", "turns in division 2",
+         "turns in division 3"),
+        (4 / 7, 0, 0, 0, 3 / 7, 0), success=0.95, discount=0.99, patrollers=2, views=views,
+        breach=Breach(tuple(sorted(cells | {(0, 0)})), State(0, 0, 0), ((9, 1),), 0.99), loop=56,
+    )  # fmt: skip
+
+
+@cache
+def boyd_with_rooms() -> Patrol:
+    """Instance 3: two patrollers in hallways with two rooms they avoid (184 states).
+
+    The turning feature fires on left turns in the hallways only, as in the released code (the dissertation
+    says any turn). The learner's start, (0,17) facing west, is a reconstruction.
+
+    Two limits on what can be learned here. The features span a potential-based shaping (potential: being in
+    a room), so one direction of weights changes no behaviour and no data identifies it. And the patrollers
+    never enter a room, so what they would do inside, 56 of the 184 states, is known only by extrapolation.
+    """
+    first_room = [(r, 10) for r in range(1, 6)] + [(2, c) for c in range(4, 10)]
+    second_room = [(5, c) for c in range(13, 16)]
+    rooms = frozenset(first_room + second_room)
+    top, right = [(0, c) for c in range(17)], [(r, 16) for r in range(1, 13)]
+    cells = rooms.union(top, right, [(13, c) for c in range(14, 17)])
+
+    def features(state: State, action: int, target: State) -> tuple[bool, ...]:
+        moved = target.cell != state.cell
+        return (
+            moved,
+            state.cell in rooms,
+            action == LEFT and (state.row == 0 or state.column == 16),
+            moved and state.cell not in rooms and target.cell in rooms,
+            moved and state.cell in rooms and target.cell not in rooms,
+        )
+
+    def view(*rules: Callable[[int, int], bool]) -> Callable[[State], bool]:
+        return lambda s: any(rule(s.row, s.column) for rule in rules)
+
+    k1 = [lambda r, c: r == 0 and c >= 14, lambda r, c: (r, c) == (1, 16)]
+    k2 = [*k1, lambda r, c: r == 0 and c >= 10]
+    k4 = [*k2, lambda r, c: r <= 1 and c >= 10, lambda r, c: r <= 6 and c in (15, 16)]
+    k6 = [
+        *k4, lambda r, c: r == 0 and c >= 8, lambda r, c: r == 2 and c >= 9, lambda r, c: r == 5 and c >= 14,
+        lambda r, c: r <= 7 and c == 16,
+    ]  # fmt: skip
+    k10 = [
+        *k6, lambda r, c: r == 0 and c >= 6, lambda r, c: r <= 4 and c >= 10, lambda r, c: r == 5 and c >= 12,
+        lambda r, c: r <= 7 and c >= 14, lambda r, c: r <= 11 and c >= 15,
+    ]  # fmt: skip
+    return _build(
+        "patrol3", _grid_states(cells), _walk(cells), features,
+        ("moves", "in a room", "turns left in hallway", "enters a room", "leaves a room"),
+        (1.0, -1.0, 0.1, 0.0, 0.0), success=0.99, discount=0.99, patrollers=2,
+        views={
+            9: view(*k1), 18: view(*k2), 33: view(*k4), 46: view(*k6), 65: view(*k10), 100: lambda s: True
+        },
+        breach=Breach(
+            tuple(sorted(cells | {(0, 17), (1, 0), (13, 13)})), State(0, 17, 2), ((1, 0), (13, 13)), 0.95
+        ),
+        loop=64, observability=18,
+    )  # fmt: skip
+
+
+def instance(number: int) -> Patrol:
+    """Patrol instance 1, 2 or 3."""
+    builders = {1: four_hallways, 2: boyd_fifth_floor, 3: boyd_with_rooms}
+    if number not in builders:
+        raise ValueError(f"patrol instances are 1, 2 and 3, got {number}")
+    return builders[number]()

@@ -1,0 +1,395 @@
+"""Adversarial learners of rewards and policies as networks: AIRL, GAIL and robust-AIRL (chapter 6.2).
+
+One learner with three parts to choose: the discriminator (what the reward is), the generator (who acts, and
+how it improves) and the truth (what the expert did, given the reports). AIRL on clean or noisy input takes
+reports at face value; robust-AIRL (Algorithm 3) samples what is behind them.
+
+Between sessions everything is carried: the reward network, its optimiser and normaliser, the generator with
+its own, generated steps, the sensor and the key. Of demonstrations nothing is (Definition 7).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import time
+from collections.abc import Mapping, Sequence
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ...models.inputs.arguments import as_key
+from ...models.inputs.extras import required
+from ...models.networks.modules import DTYPE, ActionSpace, Policy, ShapedReward
+from ...models.observation.recordings import Recording, require_recording
+from ..sessions.session import Learner
+from .discriminator import (
+    AVERAGES,
+    Discriminator,
+    ExpertTransitions,
+    Losses,
+    Transitions,
+    airl_discriminator,
+    cross_entropy,
+    gail_discriminator,
+    gradient_penalty,
+)
+from .rollouts import finished_returns
+from .truth import FaceValue, Truth, look
+from .updates import Objective, discriminator_updates
+
+if TYPE_CHECKING:
+    import equinox as eqx
+    import optax
+else:
+    eqx, optax = required("equinox"), required("optax")
+
+
+class Task(NamedTuple):
+    """What a learner is about where there is no :class:`TabularMDP`: sizes and a name, for its journal."""
+
+    name: str
+    observation_size: int
+    actions: ActionSpace
+
+    n_states: int = 0
+    feature_names: tuple[str, ...] = ()
+
+    @property
+    def n_actions(self) -> int:
+        """How many actions there are; of vectors, how long they are."""
+        return self.actions.size
+
+    def require(self, recording: Recording) -> None:
+        """Raise :class:`~i2rl.models.RecordingError` for a recording of another task, or of none."""
+        require_recording(recording, self.observation_size, self.actions.n, len(self.actions.low))
+
+    def fingerprint(self) -> str:
+        """Digest of all fields."""
+        return hashlib.sha256(json.dumps(tuple(self)).encode()).hexdigest()
+
+
+class AdversarialState(NamedTuple):
+    """All that is carried from session to session.
+
+    Fields
+    ------
+    session : int
+    key : random key
+    network : ShapedReward
+    optimiser : state of the discriminator's optimiser
+    generator : state of the generator, with its ``policy``
+    replay : Transitions, generated in the last rounds, ``[K, B, ...]``
+    rounds, pairs : int; rounds of training and reported pairs so far
+    sensor : the truth's
+    """
+
+    session: Int[Array, ""]
+    key: Array
+    network: ShapedReward
+    optimiser: Any
+    generator: Any
+    replay: Transitions
+    rounds: Int[Array, ""]
+    pairs: Int[Array, ""]
+    sensor: Any
+
+    @property
+    def weights(self) -> Float[np.ndarray, " P"]:
+        """All parameters of the reward network in one vector."""
+        parameters = (self.network.reward, self.network.potential, self.network.absorbing)
+        return np.concatenate([np.ravel(x) for x in jax.tree.leaves(parameters)])
+
+
+class AdversarialReport(NamedTuple):
+    """What a session did.
+
+    Fields
+    ------
+    session : int
+    log_likelihood : float
+        Of the expert's actions under the generator's policy, nats a step, averaged over the truth's samples
+        of the session's last round.
+    loss, expert_accuracy, generated_accuracy : float ``[rounds]``
+        Of the discriminator: cross-entropy in nats, and the shares told right.
+    returns : float ``[rounds]``
+        Mean return, by the environment's own reward, of the episodes that the generator finished; NaN where
+        none ended. Learning never sees it.
+    pairs, environment_steps : int
+        Reported pairs, and steps of the generator, in all sessions so far.
+    iterations : int
+        Rounds of this session.
+    samplings : int ``[k]``
+        Of the truth, in each look at it.
+    sensor : the truth's sensor after the session
+    seconds : float
+    weights : float ``[P]``
+    """
+
+    session: int
+    log_likelihood: float
+    loss: Float[np.ndarray, " rounds"]
+    expert_accuracy: Float[np.ndarray, " rounds"]
+    generated_accuracy: Float[np.ndarray, " rounds"]
+    returns: Float[np.ndarray, " rounds"]
+    pairs: int
+    environment_steps: int
+    iterations: int
+    samplings: Int[np.ndarray, " k"]
+    sensor: Any
+    seconds: float
+    weights: Float[np.ndarray, " P"]
+
+
+class AdversarialTraining(NamedTuple):
+    """How a session trains.
+
+    Fields
+    ------
+    rounds : int, of generator and discriminator, in a session
+    updates : int, of the discriminator in a round
+    batch : int, expert steps (and as many generated ones) an update
+    learning_rate : float, of the discriminator's Adam
+    average : "log_probabilities" (the objective of section 6.2.1) or "logits" (as released)
+    penalty : float, of the gradient (see :func:`gradient_penalty`)
+    replay : int, rounds whose generated steps the discriminator draws from
+    refresh : int, rounds between looks at the truth
+    change : float, nats; infinite for one sampling of the truth a look
+        A look samples on until the average logit of a step moves by no more
+        (:func:`~i2rl.inference.adversarial.truth.look`). The dissertation's ``delta_G`` is a sum over a
+        batch: its .1 over 256 steps is 4e-4 here.
+    samplings : int, the most in a look
+    """
+
+    rounds: int = 10
+    updates: int = 4
+    batch: int = 256
+    learning_rate: float = 1e-3
+    average: str = "log_probabilities"
+    penalty: float = 1.0
+    replay: int = 1
+    refresh: int = 5
+    change: float = np.inf
+    samplings: int = 20
+
+    def checked(self) -> AdversarialTraining:
+        """Itself. Raises ``ValueError`` naming a field that cannot be."""
+        for name in ("rounds", "updates", "batch", "replay", "refresh", "samplings"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        if not self.learning_rate > 0:
+            raise ValueError(f"learning_rate must be positive, got {self.learning_rate}")
+        for name in ("penalty", "change"):
+            if not getattr(self, name) >= 0:
+                raise ValueError(f"{name} must not be negative, got {getattr(self, name)}")
+        if self.average not in AVERAGES:
+            raise ValueError(f"average is one of {', '.join(AVERAGES)}, got {self.average!r}")
+        return self
+
+
+def adversarial(
+    name: str,
+    generator: Any,
+    discriminator: Discriminator,
+    truth: Truth | None = None,
+    training: AdversarialTraining | None = None,
+    configuration: Mapping[str, Any] | None = None,
+) -> Learner:
+    """A learner of the session protocol from its parts; its demonstrations are :class:`Recording`.
+
+    ``generator`` is a :class:`PPO`, or has as it does an ``environment``, ``settings``, ``init(key)``,
+    ``collect(state)`` and ``improve(state, rollout, rewards)``, and states with a ``policy``. ``truth`` is
+    :class:`FaceValue` by default. Recordings of one shape are compiled for once. ``configuration`` adds to
+    what identifies the learner to a journal.
+
+    Its ``update`` raises :class:`~i2rl.models.observation.recordings.RecordingError` (a ``ValueError``) for a
+    recording of another task or with numbers that are not finite, naming trajectory and step; the state it
+    was given stays valid.
+    """
+    environment = generator.environment
+    task = Task(environment.name, environment.observation_size, environment.actions)
+    truth = FaceValue() if truth is None else truth
+    how = (training or AdversarialTraining()).checked()
+    objective = discriminator_objective(discriminator, how)
+    start, trained = discriminator_updates(objective, how.updates, how.batch, how.learning_rate)
+
+    @jax.jit
+    def rewarded(network: ShapedReward, policy: Policy, rollout: Any) -> Float[Array, "T n"]:
+        return discriminator.rewards(network, policy, _steps(task, rollout))
+
+    @jax.jit
+    def logits_of(network: ShapedReward, policy: Policy, steps: Transitions) -> Float[Array, "N M"]:
+        return discriminator.logits(network, policy, steps)
+
+    def init(key: Array) -> AdversarialState:
+        k_network, k_generator, k_rest = jax.random.split(as_key(key), 3)
+        network = discriminator.init(k_network)
+        acting = generator.init(k_generator)
+        blank = blank_steps(task, (how.replay, generator.settings.steps))
+        zero = jnp.zeros((), jnp.int64)
+        parts = (network, start(network), acting, blank, zero, zero, truth.prior())
+        return AdversarialState(zero, k_rest, *parts)
+
+    def update(state: AdversarialState, recording: Recording) -> tuple[AdversarialState, AdversarialReport]:
+        began = time.perf_counter()
+        task.require(recording)
+        key, k_chain = jax.random.split(state.key)
+        network, memory, acting = state.network, state.optimiser, state.generator
+        replay, sensor, rounds = state.replay, state.sensor, int(state.rounds)
+        chain = truth.begin(recording, sensor, k_chain)
+        losses: list[Losses] = []
+        returns: list[float] = []
+        samplings: list[int] = []
+        expert: ExpertTransitions | None = None
+        for r in range(how.rounds):
+            key, k_truth, k_updates = jax.random.split(key, 3)
+            policy = acting.policy
+            if expert is None or r % how.refresh == 0:
+                logits = partial(logits_of, network, policy)
+                chain, expert, made = look(
+                    truth, chain, sensor, policy, k_truth, task.actions, logits, how.change, how.samplings
+                )
+                samplings.append(made)
+            before = acting.running
+            acting, rollout = generator.collect(acting)
+            replay = remembered(replay, _steps(task, rollout), (rounds + r) % how.replay)
+            filled = min(rounds + r + 1, how.replay)
+            network, memory, met = trained(network, memory, policy, expert, replay, filled, k_updates)
+            acting = generator.improve(acting, rollout, rewarded(network, policy, rollout))
+            losses.append(met)
+            ended = finished_returns(before, rollout)
+            returns.append(ended.mean() if len(ended) else np.nan)
+        assert expert is not None
+        sensor = truth.learned(chain, sensor)
+        pairs = state.pairs + int(np.sum(recording.live))
+        rounds += how.rounds
+        state = AdversarialState(
+            state.session + 1,
+            key,
+            network,
+            memory,
+            acting,
+            replay,
+            jnp.asarray(rounds),
+            pairs,
+            sensor,
+        )
+        return state, session_report(state, expert, losses, returns, began, samplings)
+
+    settings = {**identity(generator, discriminator), **how._asdict(), **dict(configuration or {})}
+    return Learner(name, task, settings, init, update)  # type: ignore[arg-type]
+
+
+def airl(generator: Any, *, training: AdversarialTraining | None = None, **networks: Any) -> Learner:
+    """AIRL that takes reports for the truth; ``networks`` goes to :func:`airl_discriminator`."""
+    task = generator.environment
+    networks.setdefault("discount", generator.settings.gamma)
+    discriminator = airl_discriminator(task.observation_size, task.actions, **networks)
+    return adversarial("AIRL", generator, discriminator, training=training)
+
+
+def gail(generator: Any, *, training: AdversarialTraining | None = None, **networks: Any) -> Learner:
+    """GAIL that takes reports for the truth; ``networks`` goes to :func:`gail_discriminator`."""
+    task = generator.environment
+    networks.setdefault("discount", generator.settings.gamma)
+    discriminator = gail_discriminator(task.observation_size, task.actions, **networks)
+    return adversarial("GAIL", generator, discriminator, training=training)
+
+
+# -- a round's parts ------------------------------------------------------------------------------------
+
+
+@jax.jit
+def action_log_likelihood(policy: Policy, expert: ExpertTransitions) -> Float[Array, ""]:
+    """Mean log-likelihood of the expert's actions, nats a step, over the truth's samples."""
+    each = policy.log_prob(expert.steps.observations, expert.steps.actions) @ expert.weights
+    return jnp.sum(jnp.where(expert.live, each, 0)) / jnp.sum(expert.live)
+
+
+def session_report(
+    state: AdversarialState,
+    expert: ExpertTransitions,
+    losses: Sequence[Losses],
+    returns: Sequence[float],
+    began: float,
+    samplings: Sequence[int] = (1,),
+) -> AdversarialReport:
+    """What a session did, from the state after it, its last look at the expert, and its rounds' measures."""
+    every: Losses = jax.tree.map(lambda *x: np.asarray(x, np.float64), *losses)
+    return AdversarialReport(
+        session=int(state.session),
+        log_likelihood=float(action_log_likelihood(state.generator.policy, expert)),
+        **every._asdict(),
+        returns=np.asarray(returns, np.float64),
+        pairs=int(state.pairs),
+        environment_steps=int(state.rounds) * int(np.prod(state.replay.terminated.shape[1:])),
+        iterations=len(losses),
+        samplings=np.asarray(samplings),
+        sensor=jax.tree.map(np.asarray, state.sensor),
+        seconds=time.perf_counter() - began,
+        weights=state.weights,
+    )
+
+
+def identity(generator: Any, discriminator: Discriminator) -> dict[str, Any]:
+    """What tells a journal two learners' parts apart."""
+    return {
+        "discriminator": discriminator.name,
+        "networks": dict(discriminator.settings),
+        "horizon": generator.environment.horizon,
+        "environment": dict(getattr(generator.environment, "settings", ())),
+        "agent": generator.settings._asdict(),
+    }
+
+
+def _steps(task: Task, rollout: Any) -> Transitions:
+    return Transitions(
+        rollout.observations,
+        task.actions.clip(rollout.actions),
+        rollout.next_observations,
+        rollout.terminated,
+    )
+
+
+def blank_steps(task: Task, shape: tuple[int, int]) -> Transitions:
+    """Room for generated steps, ``shape`` of them."""
+    d = task.observation_size
+    observations = jnp.zeros((*shape, d), DTYPE)
+    if task.actions.discrete:
+        actions = jnp.zeros(shape, jnp.int32)
+    else:
+        actions = jnp.zeros((*shape, task.actions.size), DTYPE)
+    return Transitions(observations, actions, observations, jnp.zeros(shape, bool))
+
+
+@jax.jit
+def remembered(replay: Transitions, new: Transitions, place: int) -> Transitions:
+    """Generated steps with those of one round in the place of another's."""
+    return Transitions(
+        *(old.at[place].set(x.reshape(old.shape[1:])) for old, x in zip(replay, new, strict=True))
+    )
+
+
+def discriminator_objective(discriminator: Discriminator, how: AdversarialTraining) -> Objective:
+    """Cross-entropy, averaged and penalised as the training says."""
+
+    def objective(
+        network: ShapedReward,
+        policy: Policy,
+        expert: Transitions,
+        weights: Float[Array, " M"],
+        generated: Transitions,
+        places: Array,
+        key: Array,
+    ) -> tuple[Float[Array, ""], Losses]:
+        loss, met = cross_entropy(discriminator, network, policy, expert, weights, generated, how.average)
+        if how.penalty:
+            first = Transitions(*(x[:, 0] for x in expert))
+            loss += how.penalty * gradient_penalty(discriminator, network, first, generated, key)
+        return loss, met
+
+    return objective

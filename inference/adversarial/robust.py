@@ -1,0 +1,245 @@
+"""robust-AIRL for continuous tasks (section 6.2, Algorithm 3): the truth behind reports, under the policy.
+
+What is done about noise is one object, the learner's :class:`~i2rl.inference.adversarial.learner.Truth`:
+
+:class:`Smoothed`
+    the sensor is known, as the dissertation has it;
+:class:`SmoothedAndFitted`
+    only its form is, and its parameters are fitted to each session by expectation-maximisation.
+
+Either way the truth is found under the generator's policy of the moment, every few rounds (``refresh`` of
+:class:`~i2rl.inference.adversarial.learner.AdversarialTraining`), and the chain goes on from where the last
+look at the session's reports left it.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ...models.networks.modules import Policy
+from ...models.observation.recordings import (
+    GaussianSensor,
+    Recording,
+    ShiftSensor,
+    Truths,
+    require_continuous,
+)
+from ..completion.gaussian import GaussianTruth, fitted_sensor
+from ..completion.partitioned import CandidateTruth, fitted_shift_sensor
+from ..sessions.session import Learner
+from .discriminator import Discriminator, ExpertTransitions, Transitions, airl_discriminator
+from .learner import AdversarialTraining, adversarial
+
+
+class Look(NamedTuple):
+    """The chain, and the policy it was last looked at under (None before the first look)."""
+
+    chain: Any
+    policy: Policy | None
+
+
+class Smoothed(NamedTuple):
+    """The truth by smoothing, the sensor being known.
+
+    Fields
+    ------
+    truth : GaussianTruth, GaussianGibbs, CandidateTruth or PartitionTruth, with the dynamics
+    sensor : the sensor it is about
+    passes : int
+        Relinearisations of the first look at a recording; later looks, which go on from it, make one.
+    """
+
+    truth: Any
+    sensor: Any
+    passes: int = 6
+
+    def prior(self) -> Any:
+        """The sensor."""
+        return self.sensor
+
+    def begin(self, recording: Recording, sensor: Any, key: Array) -> Look:
+        """Start at the reports. Raises ``ValueError`` where their sizes are not the dynamics'."""
+        return Look(self.truth.init(recording, sensor), None)
+
+    def refresh(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
+        """Relinearise where there is something to, smooth, and draw under the policy."""
+        passes = (
+            (self.passes if chain.policy is None else 1,) if isinstance(self.truth, GaussianTruth) else ()
+        )
+        found, drawn = self.truth.refresh(chain.chain, policy, key, sensor, *passes)
+        return Look(found, policy), as_expert(drawn)
+
+    def more(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
+        """Draw again; where the dynamics were linearised, they stay so."""
+        if isinstance(self.truth, GaussianTruth):
+            return chain, as_expert(self.truth.resample(chain.chain, policy, key, sensor))
+        return self.refresh(chain, sensor, policy, key)
+
+    def learned(self, chain: Look, sensor: Any) -> Any:
+        """The sensor as it was."""
+        return sensor
+
+
+class SmoothedAndFitted(NamedTuple):
+    """The truth by smoothing, the sensor being fitted in every session.
+
+    Fields
+    ------
+    truth, passes : as of :class:`Smoothed`
+    sensor : what is believed before the first session
+    fit : ``(truth, chain, policy, sensor) -> sensor``, one step of expectation-maximisation
+    steps : int, of it a session
+    """
+
+    truth: Any
+    sensor: Any
+    fit: Callable[[Any, Any, Policy, Any], Any]
+    passes: int = 6
+    steps: int = 10
+
+    def prior(self) -> Any:
+        """What is believed of the sensor before the first session."""
+        return self.sensor
+
+    def begin(self, recording: Recording, sensor: Any, key: Array) -> Look:
+        """As :meth:`Smoothed.begin`."""
+        return Smoothed(self.truth, sensor, self.passes).begin(recording, sensor, key)
+
+    def refresh(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
+        """As :meth:`Smoothed.refresh`."""
+        return Smoothed(self.truth, sensor, self.passes).refresh(chain, sensor, policy, key)
+
+    def more(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
+        """As :meth:`Smoothed.more`."""
+        return Smoothed(self.truth, sensor, self.passes).more(chain, sensor, policy, key)
+
+    def learned(self, chain: Look, sensor: Any) -> Any:
+        """The sensor under which the session's reports are likeliest."""
+        assert chain.policy is not None
+        for _ in range(self.steps):
+            sensor = self.fit(self.truth, chain.chain, chain.policy, sensor)
+        return sensor
+
+
+def fit_gaussian(truth: GaussianTruth, chain: Any, policy: Policy, sensor: GaussianSensor) -> GaussianSensor:
+    """Diagonal covariances, with the dynamics as last linearised (closed form)."""
+    return fitted_sensor(chain.reported, truth.posterior(chain, policy, sensor))
+
+
+def fit_isotropic(truth: GaussianTruth, chain: Any, policy: Policy, sensor: GaussianSensor) -> GaussianSensor:
+    """One covariance for all components of states and actions alike (closed form).
+
+    What the dynamics say little of, such as the velocities of limbs that strike the ground, could not be told
+    from noise by itself: :func:`fit_gaussian` leaves such components as they were believed to be.
+    """
+    each = fit_gaussian(truth, chain, policy, sensor)
+    common = jnp.mean(jnp.concatenate([jnp.diagonal(x) for x in each]))
+    return GaussianSensor(*(common * jnp.eye(len(x)) for x in each))
+
+
+def fit_shift(truth: CandidateTruth, chain: Any, policy: Policy, sensor: ShiftSensor) -> ShiftSensor:
+    """The probability of a shift (closed form)."""
+    return fitted_shift_sensor(sensor, chain, truth.posterior(chain, policy, sensor))
+
+
+@jax.jit
+def as_expert(drawn: Truths) -> ExpertTransitions:
+    """Draws ``[M, n, L]`` as the samples of ``n L`` expert steps."""
+
+    def rows(x: Array) -> Array:
+        return jnp.moveaxis(x.reshape(x.shape[0], -1, *x.shape[3:]), 0, 1)
+
+    steps = Transitions(
+        rows(drawn.observations), rows(drawn.actions), rows(drawn.successors), rows(drawn.terminated)
+    )
+    m = drawn.usable.shape[0]
+    return ExpertTransitions(steps, rows(drawn.usable).all(1), jnp.full(m, 1 / m))
+
+
+def robust_airl(
+    generator: Any,
+    truth: Any,
+    sensor: Any,
+    *,
+    discriminator: Discriminator | None = None,
+    training: AdversarialTraining | None = None,
+) -> Learner:
+    """robust-AIRL with a known sensor.
+
+    Parameters
+    ----------
+    generator : PPO, or as :func:`~i2rl.inference.adversarial.learner.adversarial` takes it
+    truth : GaussianTruth, GaussianGibbs, CandidateTruth or PartitionTruth
+        With the dynamics: ``gaussian_truth(robot, robot.observation_size)``, say.
+    sensor : the sensor behind the reports, such as :class:`GaussianSensor`
+    discriminator, training : by default AIRL's, and :class:`AdversarialTraining`'s own
+
+    Raises
+    ------
+    ValueError
+        For a sensor that cannot be: a covariance of another size or not positive definite, a probability
+        outside [0, 1].
+    """
+    return _learner("robust-AIRL", generator, Smoothed(truth, sensor), discriminator, training)
+
+
+def robust_airl_with_sensor(
+    generator: Any,
+    truth: Any,
+    sensor: Any,
+    fit: Callable[[Any, Any, Policy, Any], Any] = fit_gaussian,
+    *,
+    discriminator: Discriminator | None = None,
+    training: AdversarialTraining | None = None,
+) -> Learner:
+    """robust-AIRL that learns the sensor's parameters too, from ``sensor`` on; else :func:`robust_airl`."""
+    hidden = SmoothedAndFitted(truth, sensor, fit)
+    return _learner("robust-AIRL with sensor", generator, hidden, discriminator, training)
+
+
+def _learner(
+    name: str,
+    generator: Any,
+    hidden: Any,
+    discriminator: Discriminator | None,
+    training: AdversarialTraining | None,
+) -> Learner:
+    environment = generator.environment
+    if discriminator is None:
+        discriminator = airl_discriminator(
+            environment.observation_size, environment.actions, generator.settings.gamma
+        )
+    hidden = hidden._replace(sensor=_carried(hidden.sensor, environment))
+    known = {
+        "truth": type(hidden.truth).__name__,
+        "truth settings": _digest(hidden.truth),
+        "sensor": [np.asarray(x).tolist() for x in jax.tree.leaves(hidden.sensor)],
+        "passes": hidden.passes,
+    }
+    if isinstance(hidden, SmoothedAndFitted):
+        known |= {"fit": getattr(hidden.fit, "__name__", type(hidden.fit).__name__), "steps": hidden.steps}
+    return adversarial(name, generator, discriminator, hidden, training, known)
+
+
+def _carried(sensor: Any, environment: Any) -> Any:
+    """A sensor as arrays of the shapes that a fitted one has too."""
+    require_continuous(sensor)
+    if isinstance(sensor, GaussianSensor):
+        return sensor.sized(environment.observation_size, environment.actions.size)
+    return jax.tree.map(lambda x: jnp.asarray(x, float) if isinstance(x, int | float) else x, sensor)
+
+
+def _digest(truth: Any) -> str:
+    """Identifies what is assumed of the truth, but for the dynamics, which are functions."""
+    digest = hashlib.sha256()
+    for path, leaf in jax.tree_util.tree_leaves_with_path(truth):
+        if not any(getattr(part, "name", None) == "dynamics" for part in path):
+            digest.update(jax.tree_util.keystr(path).encode() + np.asarray(leaf).tobytes())
+    return digest.hexdigest()[:16]

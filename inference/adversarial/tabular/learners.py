@@ -1,0 +1,410 @@
+"""Adversarial learners of tabular tasks, with exact expert and exact generator (chapter 6.2).
+
+AIRL and GAIL in the session protocol. Both sides of the discriminator are weights on transitions: the
+expert's the posterior of the hidden truth given the reports, under the current policy; the generator's the
+occupancy of that policy. Nothing is sampled, so hidden steps, errors and both together need nothing of their
+own. The generator's step is a soft plan, not a policy gradient.
+
+Networks, optimiser, policy and key are carried from session to session, as the dissertation has it
+(``theta^{i-1}`` and ``theta_gen^{i-1}``). What they alone remember is soon overwritten, so that a statistic
+of the expert's transitions is offered besides (``memory``), and kept by default.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import TYPE_CHECKING, Any, NamedTuple, cast
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from ....models.inputs.arguments import as_key
+from ....models.inputs.extras import required
+from ....models.networks.modules import DTYPE
+from ....models.observation.demonstration import Demonstration, DemonstrationError
+from ....models.observation.evidence import (
+    Imperfection,
+    Sensor,
+    checked_demonstration,
+    fitting_sensor,
+    require_possible,
+)
+from ....models.process.mdp import TabularMDP
+from ....models.process.planning import require_discounted
+from ...completion.smoothing import evidence_of
+from ...completion.transitions import (
+    Completed,
+    TransitionStatistic,
+    exact_transitions,
+    gibbs_transitions,
+    reported_transitions,
+    summarised,
+    wide_successors,
+)
+from ...learners.lme import _digest
+from ...sensors.confusions import ConfusionNoise, ConfusionStatistic, confusion_counts, fitted_confusions
+from ...sessions.session import Learner, in_plain_numbers
+from ...sessions.statistic import blend
+from .discriminator import (
+    AVERAGES,
+    Losses,
+    Sides,
+    TabularDiscriminator,
+    cross_entropy,
+    proximal_plan,
+    tabular_airl,
+    tabular_gail,
+)
+from .training import (
+    OCCUPANCIES,
+    TabularAdversarialReport,
+    TabularAdversarialState,
+    TabularTraining,
+)
+
+if TYPE_CHECKING:
+    import optax
+else:
+    optax = required("optax")
+
+
+# -- learners -----------------------------------------------------------------------------------------
+
+
+def airl_tabular(mdp: TabularMDP, **options: Any) -> Learner:
+    """Online AIRL that takes reports for the truth; what was not seen is left out.
+
+    A session in which nothing was seen changes nothing. Options as for :func:`robust_airl_tabular`.
+    """
+    return _at_face_value("AIRL", mdp, tabular_airl, _AIRL, options)
+
+
+def robust_airl_tabular(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Learner:
+    """robust-AIRL: the posterior of the truth behind the reports, in exact expectation.
+
+    Parameters
+    ----------
+    mdp : TabularMDP
+        The expert's process without its reward; discount below 1.
+    sensor : Imperfection
+        What may be hidden, misread, or both.
+    features : float ``[S, d]``, optional
+        What the networks know of a state; which state it is by default (one-hot).
+    network : mapping, optional
+        Hidden layers: ``reward`` and ``potential`` of AIRL (32; 32, 32), ``hidden`` of GAIL (64, 8).
+    **options
+        Fields of :class:`TabularTraining`.
+
+    Returns
+    -------
+    Learner
+        Its ``update`` raises :class:`DemonstrationError` naming trajectory and step for a report that cannot
+        be, and for trajectories above the horizon; the state it was given stays valid.
+
+    Raises
+    ------
+    ValueError
+        For discount 1, a sensor for another task, features of another shape, or an option that cannot be.
+    """
+    return _in_expectation("robust-AIRL", mdp, sensor, tabular_airl, _AIRL, options)
+
+
+def gibbs_airl_tabular(
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    *,
+    draws: int = 20,
+    burn_in: int = 20,
+    change: float = 0.0,
+    **options: Any,
+) -> Learner:
+    """robust-AIRL as Algorithm 3 has it: ``draws`` sweeps of the single-site sampler in every round.
+
+    Fewer, where the average logit of a step moves by at most ``change`` with one more (the mean over steps of
+    its absolute change); with 0 always so many. The dissertation's ``delta_G`` is the sum over a batch and as
+    many generated steps: its .1 with 1,024 steps is a ``change`` of 1e-4 here.
+    """
+    if draws < 1 or burn_in < 0:
+        raise ValueError(f"a sampler needs at least one draw and no negative burn-in, got {draws}, {burn_in}")
+    if not change >= 0:
+        raise ValueError(f"change must not be negative, got {change}")
+    sensor = fitting_sensor(sensor, mdp)
+
+    def truth(
+        key: Array, log_policy: Array, evidence: Any, seen: Demonstration, horizon: int, logits: Array
+    ) -> Completed:
+        known = logits if change else None
+        return gibbs_transitions(key, mdp, log_policy, evidence, horizon, draws, burn_in, known, change)
+
+    settings = {
+        "truth": "gibbs",
+        "draws": draws,
+        "burn_in": burn_in,
+        "change": change,
+        "sensor": _digest(sensor),
+    }
+    look = _Look(truth, np.asarray(mdp.successors), sensor)
+    return _learner("robust-AIRL, Gibbs", mdp, look, tabular_airl, _AIRL, options, settings)
+
+
+def robust_airl_with_learned_sensor(
+    mdp: TabularMDP,
+    assumed: ConfusionNoise,
+    *,
+    view: Imperfection | None = None,
+    trust: float = 2.0,
+    **options: Any,
+) -> Learner:
+    """robust-AIRL that learns how often each confusion happens, by expectation-maximisation.
+
+    ``assumed`` says what may be confused; its probabilities are where learning starts, and count as
+    ``trust`` observations of each. ``view`` says what is hidden. Other options as for
+    :func:`robust_airl_tabular`.
+    """
+    if not trust > 0:
+        raise ValueError(f"trust in the assumed probabilities must be positive, got {trust}")
+    view = None if view is None else fitting_sensor(view, mdp)
+    if view is not None and view.reading is not None:
+        raise ValueError("the view says what is hidden; how reports err is learned, not given")
+    noise = np.asarray(assumed.noise)
+    for m in np.flatnonzero(~((noise > 0) & (noise < 1))):
+        raise ValueError(f"learning starts from probabilities in (0, 1); that of confusion {m} is {noise[m]}")
+    sensor = fitting_sensor(Sensor(None if view is None else view.presence, assumed.reading), mdp)
+    known: Any = (assumed, view)
+    settings = {"truth": "exact, sensor learned", "trust": trust, "sensor": _digest(known)}
+    look = _Look(_exact(mdp), np.asarray(mdp.successors), sensor, assumed, trust)
+    return _learner("robust-AIRL, sensor learned", mdp, look, tabular_airl, _AIRL, options, settings)
+
+
+def gail_tabular(mdp: TabularMDP, **options: Any) -> Learner:
+    """Online GAIL that takes reports for the truth; what was not seen is left out (section 7.4.1).
+
+    Its reward vanishes where the generator succeeds, so that planning afresh would undo what was learned:
+    ``step`` must be finite. Options as for :func:`robust_airl_tabular`.
+    """
+    return _at_face_value("GAIL", mdp, tabular_gail, _GAIL, options)
+
+
+def robust_gail_tabular(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Learner:
+    """GAIL on the posterior of the truth behind the reports; options as for :func:`robust_airl_tabular`."""
+    return _in_expectation("robust-GAIL", mdp, sensor, tabular_gail, _GAIL, options)
+
+
+_AIRL = TabularTraining()
+_GAIL = TabularTraining(entropy=0.01, step=0.1)
+
+
+class _Look(NamedTuple):
+    """How a learner looks at reports: the truth behind them, as weights on ``successors [S, A, U]``.
+
+    ``truth(key, log_policy, evidence, seen, horizon, logits)``.
+    """
+
+    truth: Callable[[Array, Float[Array, "S A"], Any, Demonstration, int, Float[Array, "S A U"]], Completed]
+    successors: np.ndarray
+    sensor: Imperfection | None
+    learned: ConfusionNoise | None = None
+    trust: float = 0.0
+
+
+def _exact(mdp: TabularMDP) -> Callable[..., Completed]:
+    def truth(
+        key: Array, log_policy: Array, evidence: Any, seen: Demonstration, horizon: int, logits: Array
+    ) -> Completed:
+        return exact_transitions(mdp, log_policy, evidence, horizon)
+
+    return truth
+
+
+def _in_expectation(
+    name: str,
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    kind: Callable[..., TabularDiscriminator],
+    defaults: TabularTraining,
+    options: Mapping[str, Any],
+) -> Learner:
+    sensor = fitting_sensor(sensor, mdp)
+    look = _Look(_exact(mdp), np.asarray(mdp.successors), sensor)
+    settings = {"truth": "exact", "sensor": _digest(sensor)}
+    return _learner(name, mdp, look, kind, defaults, options, settings)
+
+
+def _at_face_value(
+    name: str,
+    mdp: TabularMDP,
+    kind: Callable[..., TabularDiscriminator],
+    defaults: TabularTraining,
+    options: Mapping[str, Any],
+) -> Learner:
+    successors = wide_successors(mdp)
+
+    def truth(
+        key: Array, log_policy: Array, evidence: Any, seen: Demonstration, horizon: int, logits: Array
+    ) -> Completed:
+        return reported_transitions(mdp, jnp.asarray(successors), log_policy, seen, horizon)
+
+    return _learner(name, mdp, _Look(truth, successors, None), kind, defaults, options, {"truth": "reports"})
+
+
+# -- a session ----------------------------------------------------------------------------------------
+
+
+def _learner(
+    name: str,
+    mdp: TabularMDP,
+    look: _Look,
+    kind: Callable[..., TabularDiscriminator],
+    defaults: TabularTraining,
+    options: Mapping[str, Any],
+    settings: Mapping[str, Any],
+) -> Learner:
+    require_discounted(mdp)
+    chosen = dict(options)
+    features = _checked_features(mdp, chosen.pop("features", None))
+    layers = dict(chosen.pop("network", None) or {})
+    unknown = set(chosen) - set(TabularTraining._fields)
+    if unknown:
+        raise ValueError(
+            f"there is no option {sorted(unknown)[0]!r}; options are features, network, "
+            f"{', '.join(TabularTraining._fields)}"
+        )
+    how = defaults._replace(**chosen).checked()
+    discriminator = kind(mdp, features, **layers)
+    if discriminator.name == "GAIL" and np.isinf(how.step):
+        raise ValueError("the reward of GAIL vanishes where it succeeds: its step must be finite")
+    optimiser = optax.adam(how.learning_rate)
+    successors = jnp.asarray(look.successors)
+    generated = OCCUPANCIES[how.occupancy]
+    average = AVERAGES[how.average]
+
+    def init(key: Array) -> TabularAdversarialState:
+        key, fresh = jax.random.split(as_key(key))
+        network = discriminator.init(fresh)
+        uniform = jnp.where(mdp.available, -jnp.log(jnp.sum(mdp.available, 1, keepdims=True)), -jnp.inf)
+        none = None if look.learned is None else jnp.zeros(len(look.learned.noise))
+        return TabularAdversarialState(
+            network, optimiser.init(network), uniform, jnp.zeros(mdp.n_states),
+            TransitionStatistic(
+                jnp.zeros(()), jnp.zeros(successors.shape), jnp.zeros((how.horizon, mdp.n_states))
+            ),
+            () if none is None else ConfusionStatistic(none, none), jnp.zeros((), int), key,
+        )  # fmt: skip
+
+    def session(
+        state: TabularAdversarialState, demonstration: Demonstration
+    ) -> tuple[TabularAdversarialState, Any]:
+        given = None if look.sensor is None else evidence_of(mdp, look.sensor, demonstration)
+
+        def complete(key: Array, network: Any, log_policy: Array, confusions: Any) -> tuple[Completed, Any]:
+            """The truth, and the sensor's statistic with it."""
+            logits = discriminator.logits(network, log_policy, successors)
+            if look.learned is None:
+                return look.truth(key, log_policy, given, demonstration, how.horizon, logits), confusions
+            believed = look.learned._replace(noise=fitted_confusions(look.learned, confusions, look.trust))
+            sensor = Sensor(look.sensor.presence, believed.reading)  # type: ignore[union-attr]
+            evidence = evidence_of(mdp, sensor, demonstration)
+            completed = look.truth(key, log_policy, evidence, demonstration, how.horizon, logits)
+            new = confusion_counts(believed, jnp.sum(completed.steps, -1), demonstration)
+            return completed, jax.tree.map(jnp.add, state.confusions, new)
+
+        def descend(sides: Sides, log_policy: Array, carry: tuple, _: None) -> tuple:
+            network, memory = carry
+            (_, met), slope = jax.value_and_grad(
+                lambda net: cross_entropy(discriminator, net, log_policy, successors, sides, average),
+                has_aux=True,
+            )(network)
+            change, memory = optimiser.update(slope, memory, network)
+            return (optax.apply_updates(network, change), memory), met
+
+        def round_(carry: tuple, key: Array) -> tuple:
+            network, memory, log_policy, values, confusions = carry
+            completed, confusions = complete(key, network, log_policy, confusions)
+            expert = blend(state.statistic, summarised(completed), how.memory)
+            sides = Sides(expert, completed, generated(mdp, log_policy, expert.starts))
+            (network, memory), met = cast(
+                tuple, lax.scan(partial(descend, sides, log_policy), (network, memory), None, how.updates)
+            )
+            reward = discriminator.reward(network, log_policy).astype(float)
+            log_policy, values = proximal_plan(mdp, reward, log_policy, values, how.entropy, how.step)
+            last = jax.tree.map(lambda x: x[-1].astype(float), met)
+            return (network, memory, log_policy, values, confusions), last
+
+        keys = jax.random.split(state.key, how.rounds + 2)
+        begun = (state.network, state.optimiser, state.log_policy, state.values, state.confusions)
+        carry, met = cast(tuple, lax.scan(round_, begun, keys[2:]))
+        network, memory, log_policy, values, confusions = carry
+        completed, confusions = complete(keys[1], network, log_policy, confusions)
+        kept = blend(state.statistic, summarised(completed), how.memory)
+        own = jnp.sum(completed.log_likelihood)
+        parts = (network, memory, log_policy, values, kept, confusions, state.session + 1, keys[0])
+        # A report that cannot be must not spoil what was learned (a fleet raises nothing).
+        possible = jnp.isfinite(own)
+        new = jax.tree.map(partial(_chosen, possible), TabularAdversarialState(*parts), state)
+        # Where nothing of the expert is known there is nothing to tell the generator from.
+        unseen = state._replace(session=state.session + possible, key=keys[0])
+        new = jax.tree.map(partial(_chosen, jnp.any(kept.weights > 0)), new, unseen)
+        return new, _report(new, own, demonstration, met)
+
+    def _report(new: Any, own: Array, demonstration: Demonstration, met: Losses) -> Any:
+        trajectories = jnp.sum(jnp.any(jnp.asarray(demonstration.kind) != 0, axis=1))
+        noise = jnp.zeros(0)
+        if look.learned is not None:
+            noise = fitted_confusions(look.learned, new.confusions, look.trust)
+        fields: dict[str, Any] = {
+            "session": new.session, "log_likelihood": own / jnp.maximum(trajectories, 1),
+            "demonstration_log_likelihood": own, "iterations": how.rounds, "noise": noise,
+            "seconds": jnp.array(jnp.nan), "weights": new.weights,
+        }  # fmt: skip
+        return TabularAdversarialReport(**fields, **met._asdict())
+
+    run = jax.jit(session)
+
+    def update(
+        state: TabularAdversarialState, demonstration: Demonstration
+    ) -> tuple[TabularAdversarialState, Any]:
+        began = time.perf_counter()
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="a session")
+        lengths = demonstration.lengths
+        if lengths.max() > how.horizon:
+            raise DemonstrationError(
+                f"trajectory {int(lengths.argmax())} has {lengths.max()} steps, above the learner's horizon "
+                f"of {how.horizon}: cut it with Demonstration.fragments, or set horizon"
+            )
+        new, report = run(state, demonstration.bucketed())
+        if not np.isfinite(report.demonstration_log_likelihood):
+            require_possible(look.sensor or Sensor(), mdp, demonstration)
+            raise DemonstrationError("a trajectory has probability zero under the current policy")
+        return new, in_plain_numbers(report, time.perf_counter() - began)
+
+    known: Any = features
+    digest = {"features": _digest(known), "network": {k: list(v) for k, v in layers.items()}}
+    configuration = {"discriminator": discriminator.name, **how._asdict(), **digest, **settings}
+    return Learner(name, mdp, configuration, init, update, session)
+
+
+def _chosen(possible: Array, new: Array, old: Array) -> Array:
+    if jax.dtypes.issubdtype(new.dtype, jax.dtypes.prng_key):
+        data = jnp.where(possible, jax.random.key_data(new), jax.random.key_data(old))
+        return jax.random.wrap_key_data(data, impl=jax.random.key_impl(new))
+    return jnp.where(possible, new, old)
+
+
+def _checked_features(mdp: TabularMDP, features: ArrayLike | None) -> Float[Array, "S d"]:
+    """Features of states with mean zero and deviation one, or one-hot."""
+    if features is None:
+        return jnp.eye(mdp.n_states, dtype=DTYPE)
+    x = np.asarray(features, float)
+    if x.ndim != 2 or len(x) != mdp.n_states or not x.shape[1]:
+        raise ValueError(f"features of states have shape [S, d] = [{mdp.n_states}, d], got {list(x.shape)}")
+    if not np.isfinite(x).all():
+        s, k = np.argwhere(~np.isfinite(x))[0]
+        raise ValueError(f"feature {k} of state {mdp.state_names[s]} is {x[s, k]}, not a number")
+    spread = x.std(0)
+    return jnp.asarray((x - x.mean(0)) / np.where(spread > 0, spread, 1.0), DTYPE)

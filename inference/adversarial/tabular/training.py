@@ -1,0 +1,138 @@
+"""How adversarial learners of tabular tasks train, what they carry, and what they report."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ...completion.transitions import TransitionStatistic, discounted_transitions, visited_transitions
+from .discriminator import AVERAGES
+
+OCCUPANCIES = {"visited": visited_transitions, "discounted": discounted_transitions}
+
+
+class TabularTraining(NamedTuple):
+    """How a session trains.
+
+    Fields
+    ------
+    rounds : int
+        Rounds of discriminator and generator.
+    updates : int
+        Of the discriminator in a round.
+    learning_rate : float
+        Of its Adam.
+    entropy : float
+        What the generator earns for a nat of entropy.
+    step : float
+        Of the generator, see :func:`~i2rl.inference.adversarial.tabular.discriminator.proximal_plan`;
+        infinite for a plan afresh.
+    memory : float
+        Exponent of the current session's share in the statistic of the expert's transitions: 1 counts all
+        sessions alike, less forgets slowly, 0 keeps nothing.
+    occupancy : {"visited", "discounted"}
+        The generator's transitions: begun where the expert was and followed as long, or discounted from
+        ``p0``.
+    average : {"log probabilities", "logits"}
+        ``E[log D]``, or as the authors have it ``log D`` of the mean logit, which keeps no statistic.
+    horizon : int
+        Longest trajectory of a demonstration.
+    """
+
+    rounds: int = 30
+    updates: int = 4
+    learning_rate: float = 3e-3
+    entropy: float = 1.0
+    step: float = np.inf
+    memory: float = 1.0
+    occupancy: str = "visited"
+    average: str = "log probabilities"
+    horizon: int = 16
+
+    def checked(self) -> TabularTraining:
+        """Itself. Raises ``ValueError`` naming a field that cannot be."""
+        for name in ("rounds", "updates", "horizon"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("learning_rate", "step"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name} must be positive, got {getattr(self, name)}")
+        if not self.entropy >= 0 or (self.entropy == 0 and np.isinf(self.step)):
+            raise ValueError(
+                f"the entropy's worth must be positive, or 0 with a finite step, got {self.entropy}"
+            )
+        if not 0 <= self.memory <= 1:
+            raise ValueError(f"memory is an exponent in [0, 1], got {self.memory}")
+        for name, known in (("occupancy", OCCUPANCIES), ("average", AVERAGES)):
+            if getattr(self, name) not in known:
+                raise ValueError(f"{name} is one of {', '.join(known)}, got {getattr(self, name)!r}")
+        if self.average == "logits" and self.memory > 0:
+            raise ValueError("the average of logits is over a session's own steps: memory must be 0")
+        return self
+
+
+class TabularAdversarialState(NamedTuple):
+    """All that is carried from session to session.
+
+    Fields
+    ------
+    network : the discriminator's
+    optimiser : its optimiser's state
+    log_policy : float ``[S, A]``, the generator
+    values : float ``[S]``, planning's warm start
+    statistic : TransitionStatistic, of the expert so far (what ``memory`` leaves of it)
+    confusions : ConfusionStatistic, or empty where the sensor is given
+    session : int
+    key : random key
+    """
+
+    network: Any
+    optimiser: Any
+    log_policy: Float[Array, "S A"]
+    values: Float[Array, " S"]
+    statistic: TransitionStatistic
+    confusions: Any
+    session: Int[Array, ""]
+    key: Array
+
+    @property
+    def weights(self) -> Float[Array, " P"]:
+        """All parameters of the discriminator's network in one vector."""
+        return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(self.network)])
+
+
+class TabularAdversarialReport(NamedTuple):
+    """What a session did.
+
+    Fields
+    ------
+    session : int
+    log_likelihood : float
+        Of the session's demonstration under the new policy, nats per trajectory, exact. At face value, of
+        the reported actions given the reported states.
+    demonstration_log_likelihood : float
+        The same in all.
+    loss, expert_accuracy, generated_accuracy : float ``[rounds]``
+        Of the discriminator: cross-entropy in nats, and the shares of either side it told right.
+    iterations : int
+        Rounds.
+    noise : float ``[M]``
+        Learned probabilities of the confusions; empty where the sensor is given.
+    seconds : float
+    weights : float ``[P]``
+    """
+
+    session: int
+    log_likelihood: float
+    demonstration_log_likelihood: float
+    loss: Float[np.ndarray, " rounds"]
+    expert_accuracy: Float[np.ndarray, " rounds"]
+    generated_accuracy: Float[np.ndarray, " rounds"]
+    iterations: int
+    noise: Float[np.ndarray, " M"]
+    seconds: float
+    weights: Float[np.ndarray, " P"]

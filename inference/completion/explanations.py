@@ -1,0 +1,131 @@
+"""A jumble of trajectories as a mixture sees it: how well each way of doing the task explains each one.
+
+Trajectories that were seen whole need no completion: their visits are known, and their log-likelihood is
+linear in the log-policy. Where any step was hidden, lost or misread, every trajectory is completed under
+every way by a forward-backward pass.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ...models.observation.demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration
+from ...models.observation.evidence import Imperfection, fitting_sensor
+from ...models.process.mdp import TabularMDP
+from .smoothing import Evidence, evidence_of, smooth_all
+
+
+class SeenWhole(NamedTuple):
+    """Fully seen trajectories: visits, log-probability of what no reward changes, and which rows exist."""
+
+    visits: Float[Array, "n S A"]
+    constant: Float[Array, " n"]
+    live: Bool[Array, " n"]
+
+
+class SeenInPart(NamedTuple):
+    """Trajectories with gaps or noise: evidence of every step, which steps were seen, which rows exist."""
+
+    evidence: Evidence
+    seen: Bool[Array, "n L"]
+    live: Bool[Array, " n"]
+
+
+Jumble = SeenWhole | SeenInPart
+
+
+class Explained(NamedTuple):
+    """A jumble under one way of doing the task.
+
+    Fields
+    ------
+    log_likelihood : float ``[n]``
+        Exact, hidden steps summed out; ``-inf`` where the way cannot have produced the trajectory.
+    visits : float ``[n, S, A]``
+        Expected visits of all steps.
+    seen : float ``[n, S, A]``
+        Expected visits of the steps that were seen.
+    """
+
+    log_likelihood: Float[Array, " n"]
+    visits: Float[Array, "n S A"]
+    seen: Float[Array, "n S A"]
+
+
+def is_seen_whole(sensor: Imperfection, demonstration: Demonstration) -> bool:
+    """Whether every step was perceived exactly, state and action."""
+    kind, state, action, _ = (np.asarray(x) for x in demonstration)
+    gaps = (kind == HIDDEN) | (kind == LOST) | ((kind == SEEN) & ((state == UNKNOWN) | (action == UNKNOWN)))
+    return sensor.reading is None and not gaps.any()
+
+
+def seen_whole(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> SeenWhole:
+    """Gather the visits of fully seen trajectories; traceable."""
+    sensor = fitting_sensor(sensor, mdp)
+    kind, state, action, _ = (jnp.asarray(x) for x in demonstration)
+    present = jnp.ones(mdp.n_states) if sensor.presence is None else sensor.presence
+
+    def one(kind: Int[Array, " L"], state: Int[Array, " L"], action: Int[Array, " L"]) -> tuple:
+        alive = kind != PAD
+        visits = jnp.zeros((mdp.n_states, mdp.n_actions)).at[state, action].add(jnp.where(alive, 1.0, 0.0))
+        arrived = mdp.successors[state[:-1], action[:-1]] == state[1:, None]
+        moves = jnp.sum(jnp.where(arrived, mdp.probabilities[state[:-1], action[:-1]], 0.0), axis=1)
+        possible = jnp.where(mdp.available[state, action], present[state], 0.0)
+        total = jnp.log(mdp.initial[state[0]]) + jnp.sum(jnp.where(alive, jnp.log(possible), 0.0))
+        total += jnp.sum(jnp.where(alive[1:], jnp.log(moves), 0.0))
+        return visits, jnp.where(alive[0], total, 0.0)
+
+    visits, constant = jax.vmap(one)(kind, jnp.maximum(state, 0), jnp.maximum(action, 0))
+    return SeenWhole(visits, constant, kind[:, 0] != PAD)
+
+
+def seen_in_part(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> SeenInPart:
+    """Evaluate a sensor on trajectories with gaps or noise; traceable."""
+    evidence = evidence_of(mdp, sensor, demonstration)
+    return SeenInPart(evidence, jnp.asarray(demonstration.kind) == SEEN, evidence.live[:, 0])
+
+
+def explain(mdp: TabularMDP, log_policy: Float[Array, "S A"], jumble: Jumble) -> Explained:
+    """Explain every trajectory by one policy."""
+    if isinstance(jumble, SeenWhole):
+        visits, constant, live = jumble
+        gained = jnp.einsum("nsa,sa->n", visits, jnp.where(mdp.available, log_policy, 0.0))
+        return Explained(jnp.where(live, constant + gained, 0.0), visits, visits)
+    log_likelihood, pairs, _ = smooth_all(mdp, log_policy, jumble.evidence)
+    seen = jnp.einsum("nlsa,nl->nsa", pairs, jumble.seen.astype(float))
+    return Explained(log_likelihood, jnp.sum(pairs, axis=1), seen)
+
+
+def explain_each(
+    mdp: TabularMDP,
+    log_policies: Float[Array, "D S A"],
+    jumble: Jumble,
+    present: Bool[Array, " D"] | None = None,
+) -> Explained:
+    """Explain every trajectory by every policy: fields as in :class:`Explained`, with a leading ``D``.
+
+    Those of policies that are not ``present`` may be anything finite.
+    """
+    if isinstance(jumble, SeenWhole):
+        return jax.vmap(lambda x: explain(mdp, x, jumble))(log_policies)
+    # One policy at a time: a pass holds [n, L, S, A] posteriors, which ways should not multiply.
+    if present is None:
+        return lax.map(lambda x: explain(mdp, x, jumble), log_policies)
+    n = len(jumble.live)
+    nothing = Explained(jnp.zeros(n), *(jnp.zeros((n, mdp.n_states, mdp.n_actions)),) * 2)
+    return lax.map(
+        lambda x: lax.cond(x[1], lambda: explain(mdp, x[0], jumble), lambda: nothing),
+        (log_policies, present),
+    )
+
+
+def without_reward(mdp: TabularMDP, jumble: Jumble) -> Explained:
+    """Explain every trajectory by somebody who does anything: what is known before any reward is."""
+    uniform = jnp.where(mdp.available, -jnp.log(jnp.sum(mdp.available, axis=1))[:, None], -jnp.inf)
+    return explain(mdp, uniform, jumble)

@@ -1,0 +1,142 @@
+"""The Boltzmann-rational expert: ``pi(a | s) ~ exp(eta Q*(s, a))``.
+
+The likelihood of Bayesian and maximum-likelihood IRL (Ramachandran and Amir 2007; Babes-Vroman et al. 2011;
+Choi and Kim 2012). Unlike the soft policy of maximum causal entropy, the expert plans as if it would act
+optimally from the next step on, and only then errs. Trajectories enter through their visit counts alone: the
+dynamics' part of their probability does not depend on the weights and is left out.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float
+
+from ...models.observation.demonstration import HIDDEN, LOST, PAD, UNKNOWN, Demonstration, DemonstrationError
+from ...models.observation.evidence import checked_demonstration
+from ...models.process.mdp import TabularMDP, _PairNames
+from ...models.process.planning import action_values, hard_plan, policy_values, reward_of
+
+# Inverse temperature of the published baselines.
+ETA = 10.0
+# Scaled weights lie in [-BOX, BOX]: the likelihood of a greedy expert has no maximum without a bound.
+BOX = 1.0
+
+
+def optimal_action_values(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
+    """``Q*(s, a)``, differentiable in the weights wherever each state has one best action.
+
+    There ``dQ* / dtheta = phi + gamma P mu`` with ``mu`` the features to go of the greedy policy; where
+    several actions are best, the derivative is that of the first. ``-inf`` where an action is unavailable.
+    """
+    plan = hard_plan(mdp, reward_of(mdp, lax.stop_gradient(weights)))
+    greedy = jax.nn.one_hot(jnp.argmax(plan.action_values, axis=1), mdp.n_actions)
+    reward = reward_of(mdp, weights)
+    return action_values(mdp, reward, policy_values(mdp, greedy, reward))
+
+
+def boltzmann_log_policy(
+    mdp: TabularMDP, weights: Float[Array, " K"], eta: float | Array = ETA
+) -> Float[Array, "S A"]:
+    """``log pi(a | s)``, the log-softmax of ``eta Q*`` over available actions; ``-inf`` where unavailable.
+
+    ``eta`` is the inverse temperature, per unit of value. Differentiable as
+    :func:`optimal_action_values`. Raises ``ValueError`` for discount 1.
+    """
+    return jax.nn.log_softmax(eta * optimal_action_values(mdp, weights), axis=1)
+
+
+def boltzmann_log_likelihoods(
+    mdp: TabularMDP,
+    weights: Float[Array, " K"],
+    counts: Float[Array, "n S A"],
+    eta: float | Array = ETA,
+) -> Float[Array, " n"]:
+    """``sum_{s, a} N_i(s, a) log pi(a | s)`` of each trajectory's visits ``N_i``, in nats.
+
+    Differentiable as :func:`optimal_action_values`. Raises ``DemonstrationError`` for a visit to an
+    unavailable action, naming trajectory, state and action (under a trace, where nothing can be raised, the
+    trajectory's log-likelihood is ``-inf``).
+    """
+    require_available_visits(mdp, counts)
+    return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, eta), counts)
+
+
+def count_log_likelihoods(
+    mdp: TabularMDP, log_policy: Float[Array, "S A"], counts: Float[Array, "n S A"]
+) -> Float[Array, " n"]:
+    """``sum N_i log pi`` with ``0 log 0 = 0``."""
+    finite = jnp.where(mdp.available, log_policy, 0.0)
+    impossible = jnp.any((counts > 0) & ~mdp.available, axis=(1, 2))
+    return jnp.where(impossible, -jnp.inf, jnp.einsum("nsa,sa->n", counts, finite))
+
+
+def require_available_visits(mdp: TabularMDP, counts: Float[Array, "n S A"]) -> None:
+    """Raise ``DemonstrationError`` if a trajectory's counts visit an unavailable action."""
+    if isinstance(counts, jax.core.Tracer) or isinstance(mdp.available, jax.core.Tracer):
+        return
+    given, expected = np.asarray(counts), (mdp.n_states, mdp.n_actions)
+    if given.ndim != 3 or given.shape[1:] != expected:
+        raise ValueError(f"visit counts must have shape [n, S, A] = [n, {expected[0]}, {expected[1]}], "
+                         f"got {list(given.shape)}")  # fmt: skip
+    wrong = np.argwhere((given > 0) & ~np.asarray(mdp.available))
+    if len(wrong):
+        i, s, a = wrong[0]
+        raise DemonstrationError(
+            f"trajectory {i} visits {_PairNames(mdp.labels).pair(s, a)}, which is not available there"
+        )
+
+
+def visit_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.ndarray, "n S A"]:
+    """``N_i(s, a)``: how often each trajectory visits each pair; padding rows count nothing.
+
+    Raises ``DemonstrationError`` that names trajectory and step: for a step that was hidden, lost or seen in
+    part (these methods need to see every step), for an index that is no state or action, and for an action
+    that is not available; and without a step in any trajectory.
+    """
+    kind, state, action, _ = checked_demonstration(mdp, demonstration)
+    live = kind != PAD
+    if not live.any():
+        raise DemonstrationError("the demonstration has no step; this method needs at least one trajectory")
+    seen = live & ~np.isin(kind, (HIDDEN, LOST)) & (state != UNKNOWN) & (action != UNKNOWN)
+    names = _PairNames(mdp.labels)
+    if (live & ~seen).any():
+        i, t = np.argwhere(live & ~seen)[0]
+        why = {HIDDEN: "is hidden", LOST: "is a lost frame"}.get(int(kind[i, t]), "was seen only in part")
+        raise DemonstrationError(
+            f"trajectory {i}, step {t} {why}; this method needs to see the state and action of every step"
+        )
+    i, t = np.nonzero(seen)
+    s, a = state[i, t], action[i, t]
+    barred = np.flatnonzero(~np.asarray(mdp.available)[s, a])
+    if len(barred):
+        at = barred[0]
+        raise DemonstrationError(
+            f"trajectory {i[at]}, step {t[at]}: {names.pair(s[at], a[at])} is not available there"
+        )
+    counts = np.zeros((len(kind), mdp.n_states, mdp.n_actions))
+    np.add.at(counts, (i, s, a), 1.0)
+    return counts
+
+
+# -- what the baselines share ---------------------------------------------------------------------------
+
+
+def random_weights(key: Array, n_features: int) -> Float[Array, " K"]:
+    """Uniform on the box."""
+    return jax.random.uniform(key, (n_features,), float, -BOX, BOX)
+
+
+def reflected(x: Float[Array, " K"]) -> Float[Array, " K"]:
+    """Fold the line into the box, as between two mirrors."""
+    along = jnp.mod(x + BOX, 4 * BOX)
+    return jnp.where(along > 2 * BOX, 4 * BOX - along, along) - BOX
+
+
+def require_positive(**numbers: float) -> None:
+    """Raise ``ValueError`` naming the first number that is not positive and finite."""
+    for name, number in numbers.items():
+        if not (number > 0 and np.isfinite(number)):
+            raise ValueError(f"{name} must be positive, got {number}")

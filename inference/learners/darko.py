@@ -1,0 +1,355 @@
+"""DARKO (Rhinehart and Kitani 2017) as an online learner: gradient steps on the session's own feature margin.
+
+A session is what was seen from one goal to the next (section 3.2): :func:`goal_sessions` cuts a stream of
+behaviour there. Its weights are those of the session before, moved down the gradient of the margin
+``E[phi | pi] - phi_hat``, ``pi`` being the soft policy of the complete MDP. Nothing but the weights is
+carried on.
+
+That makes it ME-I2RL with its statistic emptied, as "Generalization to Existing Methods" (chapter 4) says:
+with ``|X_{i-1}| = 0`` and ``phi_hat^{1:i-1} = 0`` Eq. 4.2 leaves ``phi_hat^{1:i} = phi_hat^i``, the
+program of Theorem 1 is that of the session alone, and the step taken here is down the gradient of its dual.
+The session is summarised by the very ``features`` statistic of ME-I2RL.
+
+Where a goal ends the session but not the task, as on a patrol, the MDP goes on after it, and so does the
+plan: what follows is filled in under the current policy, as for any fragment. DARKO itself makes goals
+absorbing. Where they do end the task, :func:`ending_at` says so in the MDP and nothing follows. Which it
+is matters: a soft planner is paid for keeping its options open, up to ``log |A|`` nats a step, and where a
+goal ends that pay every weight has to fall until arriving is worth it. DARKO's own planner, undiscounted and
+deterministic, conditions on arriving instead; with chance in the dynamics no policy can promise to arrive.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections.abc import Iterable, Iterator
+from dataclasses import replace
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ...models.inputs.arguments import as_key
+from ...models.observation.demonstration import PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
+from ...models.observation.evidence import Sensor, checked_demonstration, require_possible
+from ...models.process.mdp import Labels, TabularMDP
+from ...models.process.planning import features_to_go, require_discounted, reward_of, soft_plan
+from ..completion.smoothing import Evidence, evidence_of, smooth_all
+from ..sessions.scaling import on_scaled_features
+from ..sessions.session import Learner, Report
+from ..sessions.statistic import FEATURES, FeatureStatistic, complete
+
+
+class DarkoState(NamedTuple):
+    """What DARKO carries on.
+
+    ``weights [K]``; an empty statistic; ``values [S]``, the weights' soft values, from which planning
+    starts (they follow from the weights and are no statistic); sessions so far.
+    """
+
+    weights: Float[Array, " K"]
+    statistic: tuple[()]
+    values: Float[Array, " S"]
+    session: Int[Array, ""]
+
+
+class Margin(NamedTuple):
+    """A session under some weights: ``margin [K]``, ``E[phi | pi] - phi_hat``, and what it was made of.
+
+    ``statistic`` holds ``phi_hat`` and the start distribution, ``values [S]`` are the weights' soft values
+    and ``log_likelihood`` is that of the demonstration, in nats (-inf if it cannot be).
+    """
+
+    margin: Float[Array, " K"]
+    statistic: FeatureStatistic
+    values: Float[Array, " S"]
+    log_likelihood: Float[Array, ""]
+
+
+def feature_margin(
+    mdp: TabularMDP,
+    weights: Float[Array, " K"],
+    demonstration: Demonstration,
+    values: Float[Array, " S"] | None = None,
+) -> Margin:
+    """Margin ``E[phi | pi] - phi_hat`` of a session alone, per trajectory, in units of discounted features.
+
+    Both expectations start where the session's trajectories did. ``values [S]`` warm-starts the plan. The
+    margin is the gradient of ``start.V - theta.phi_hat``, the dual of ME-I2RL's ``features`` program for
+    this session's statistic.
+    """
+    return _session_margin(mdp, weights, checked_demonstration(mdp, demonstration), values)
+
+
+@jax.jit
+def _session_margin(
+    mdp: TabularMDP,
+    weights: Float[Array, " K"],
+    demonstration: Demonstration,
+    values: Float[Array, " S"] | None,
+) -> Margin:
+    return _margin(mdp, weights, _seen(mdp, demonstration), values)
+
+
+def _seen(mdp: TabularMDP, demonstration: Demonstration) -> tuple[Evidence, Bool[Array, "n L"]]:
+    return evidence_of(mdp, Sensor(), demonstration), jnp.asarray(demonstration.kind) == SEEN
+
+
+def _margin(
+    mdp: TabularMDP, weights: Float[Array, " K"], observed: tuple, values: Float[Array, " S"] | None
+) -> Margin:
+    evidence, seen = observed
+    plan = soft_plan(mdp, reward_of(mdp, weights), values)
+    completed = complete(mdp, smooth_all(mdp, plan.log_policy, evidence), evidence.live, seen)
+    statistic = FEATURES.of_session(mdp, plan, completed)
+    expected = statistic.start @ features_to_go(mdp, plan.policy)
+    own = jnp.sum(completed.expectations.log_likelihood)
+    return Margin(expected - statistic.features, statistic, plan.values, own)
+
+
+def darko_i2rl(
+    mdp: TabularMDP,
+    *,
+    learning_rate: float = 1.0,
+    decay: float = 0.5,
+    radius: float = math.inf,
+    steps: int = 1,
+) -> Learner:
+    """DARKO: online projected gradient descent on the feature margin, under full observability.
+
+    ``theta^i = project(theta^{i-1} - lambda_i (E[phi | pi] - phi_hat^i))``, with soft value iteration for
+    ``pi`` and the Euclidean ball of ``radius`` to project on. Goals and the cutting of the stream are
+    :func:`goal_sessions`'s part; any other demonstration is a session too. Frames that were lost are
+    completed under the current policy; a hidden step is an error, as for ME-I2RL: the learner is taken to
+    see the expert at all times.
+
+    Parameters
+    ----------
+    mdp : TabularMDP
+        The expert's process, discount below 1; goals that end the task as :func:`ending_at` makes them.
+        Its initial distribution must allow the goals, where sessions start.
+    learning_rate : float
+        ``lambda``, per unit of discounted scaled features (:mod:`~i2rl.models.process.units`). The default is
+        what ``i2rl run methods`` finds good on the second patrol, from sessions of five steps.
+    decay : float
+        ``lambda_i = lambda / i^decay``. One half is what keeps the regret of online gradient descent
+        without a horizon sublinear (Zinkevich 2003); 0 keeps the rate constant.
+    radius : float
+        Bound on the Euclidean norm of the scaled weights; none by default.
+    steps : int
+        Gradient steps a session.
+
+    Returns
+    -------
+    Learner
+        The reports' ``log_likelihood`` is that of the session alone (nothing else is kept), ``gradient``
+        the norm of the margin the session began with. ``learner.log_likelihood`` is None: there is no
+        statistic to have one. ``update`` raises :class:`DemonstrationError` naming trajectory and step for
+        an observation the model rules out.
+
+    Raises
+    ------
+    ValueError
+        For discount 1 or an option that is out of range.
+    """
+    return on_scaled_features(mdp, partial(_learner, learning_rate, decay, radius, steps))
+
+
+def _learner(learning_rate: float, decay: float, radius: float, steps: int, mdp: TabularMDP) -> Learner:
+    require_discounted(mdp)
+    if not 0 < learning_rate < math.inf or not radius > 0:
+        raise ValueError(f"learning rate and radius must be positive, got {learning_rate} and {radius}")
+    if not decay >= 0:
+        raise ValueError(f"the decay must not be negative, got {decay}")
+    if steps < 1:
+        raise ValueError(f"a session needs at least one step, got {steps}")
+    settings = _Settings(
+        jnp.asarray(learning_rate, float),
+        jnp.asarray(decay, float),
+        jnp.asarray(radius, float),
+        jnp.asarray(steps),
+    )
+
+    def init(key: Array) -> DarkoState:
+        weights = jax.random.uniform(as_key(key), (mdp.n_features,), float)
+        return DarkoState(weights, (), jnp.zeros(mdp.n_states), jnp.zeros((), int))
+
+    def session(state: DarkoState, demonstration: Demonstration) -> tuple[DarkoState, Report]:
+        return _session(mdp, settings, state, demonstration)
+
+    def update(state: DarkoState, demonstration: Demonstration) -> tuple[DarkoState, Report]:
+        began = time.perf_counter()
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="a session")
+        new, report = session(state, demonstration.bucketed())
+        if not np.isfinite(report.demonstration_log_likelihood):
+            require_possible(Sensor(), mdp, demonstration)
+            raise DemonstrationError("a trajectory has probability zero under the current policy")
+        return new, report.in_plain_numbers(time.perf_counter() - began)
+
+    configuration = {"learning_rate": learning_rate, "decay": decay, "radius": radius, "steps": steps}
+    return Learner("DARKO", mdp, configuration, init, update, session)
+
+
+class _Settings(NamedTuple):
+    rate: Float[Array, ""]
+    decay: Float[Array, ""]
+    radius: Float[Array, ""]
+    steps: Int[Array, ""]
+
+
+@jax.jit
+def _session(
+    mdp: TabularMDP, settings: _Settings, state: DarkoState, demonstration: Demonstration
+) -> tuple[DarkoState, Report]:
+    observed = _seen(mdp, demonstration)
+    number = state.session + 1
+    rate = settings.rate * number.astype(float) ** -settings.decay
+
+    def descend(i: Int[Array, ""], carry: tuple) -> tuple:
+        weights, found, first = carry
+        moved = weights - rate * found.margin
+        length = jnp.linalg.norm(moved)
+        inside = moved * jnp.where(length > settings.radius, settings.radius / length, 1.0)
+        # The zeroth step only looks: one margin to compile serves the start, the steps and the end.
+        weights = jnp.where(i > 0, inside, weights)
+        following = _margin(mdp, weights, observed, found.values)
+        return weights, following, jnp.where(i > 0, first, jnp.linalg.norm(following.margin))
+
+    k, s = mdp.n_features, mdp.n_states
+    nothing = FeatureStatistic(jnp.zeros(()), jnp.zeros(k), jnp.zeros(s))
+    unseen = Margin(jnp.zeros(k), nothing, state.values, jnp.array(jnp.nan))
+    begin = (state.weights, unseen, jnp.array(jnp.nan))
+    weights, after, first = lax.fori_loop(0, settings.steps + 1, descend, begin)
+    report: dict[str, Any] = {
+        "session": number,
+        "log_likelihood": FEATURES.log_likelihood(mdp, weights, after.values, after.statistic),
+        "demonstration_log_likelihood": after.log_likelihood,
+        "gradient": first,
+        "iterations": settings.steps,
+        "solver_iterations": settings.steps,
+        "converged": jnp.array(True),
+        "seconds": jnp.array(jnp.nan),
+        "weights": weights,
+    }
+    possible = jnp.isfinite(after.log_likelihood)
+    learned = DarkoState(weights, (), after.values, number)
+    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), learned, state), Report(**report)
+
+
+# -- goals --------------------------------------------------------------------------------------------
+
+
+def goal_sessions(stream: Iterable[Demonstration], goals: Bool[np.ndarray, " S"]) -> Iterator[Demonstration]:
+    """Cut a stream of behaviour where a goal is reached; each part is a session, ready for ``update``.
+
+    ``stream`` holds consecutive pieces of one walk (``demonstration.sessions()``, say), their rows in order
+    of time; ``goals [S]`` marks the goal states. A goal is reached by being seen in it after being elsewhere:
+    waiting there is no second arrival. The pair at the goal begins the next session. A session is one
+    trajectory, padded to a power of two so that few lengths occur. What comes after the last goal is no
+    session yet and is not given out. Raises ``ValueError`` for marks that are not a boolean vector.
+    """
+    goals = np.asarray(goals)
+    if goals.ndim != 1 or goals.dtype != bool:
+        raise ValueError(
+            f"goals must be a boolean array [S], one mark a state, got {goals.dtype} {goals.shape}"
+        )
+    codes: list[np.ndarray] = []
+    scores: list[float] = []
+    before = UNKNOWN
+    for piece in stream:
+        steps = np.asarray(piece.kind).reshape(-1) != PAD
+        for code, score in zip(
+            piece.codes.reshape(-1, 3)[steps], np.asarray(piece.score).reshape(-1)[steps], strict=True
+        ):
+            state = int(code[1]) if code[0] == SEEN else UNKNOWN
+            if codes and state not in (UNKNOWN, before) and goals[state]:
+                yield _row(codes, scores)
+                codes, scores = [], []
+            codes.append(code)
+            scores.append(score)
+            before = state
+
+
+def _row(codes: list[np.ndarray], scores: list[float]) -> Demonstration:
+    row = Demonstration.from_codes(np.array(codes)[None])
+    return row._replace(score=np.array(scores, float)[None]).bucketed()
+
+
+def stopping_places(stream: Iterable[Demonstration], n_states: int, steps: int) -> Bool[np.ndarray, " S"]:
+    """States in which the expert was seen for at least ``steps`` steps running: DARKO's goals are discovered
+    as the places where a person stops.
+
+    ``stream`` as for :func:`goal_sessions`. Where moves may fail, choose ``steps`` so that staying so long
+    by chance is rare. Raises ``ValueError`` for fewer than two steps.
+    """
+    if steps < 2:
+        raise ValueError(f"a stop lasts at least two steps, got {steps}")
+    found = np.zeros(n_states, bool)
+    before, stayed = UNKNOWN, 0
+    for piece in stream:
+        for kind, state in zip(np.asarray(piece.kind).flat, np.asarray(piece.state).flat, strict=True):
+            if kind == PAD:
+                continue
+            here = int(state) if kind == SEEN else UNKNOWN
+            stayed = stayed + 1 if here == before else 1
+            before = here
+            if here != UNKNOWN and stayed >= steps:
+                found[here] = True
+    return found
+
+
+def ending_at(mdp: TabularMDP, goals: Bool[np.ndarray, " S"]) -> TabularMDP:
+    """The process in which reaching a goal ends the task, as DARKO's planner has it.
+
+    One state is added, the last, which is never left and has no features. Where states have names it is
+    "end", or "end 2" if a state has that name. Every move to a goal from another state leads there instead.
+    The goals stay as states to start from and to wait in, since a session begins where the last one ended.
+    DARKO plans for one goal at a time; here all of them end the task alike. To
+    learn from an episode append the end as its last step (:func:`with_end`), or the model takes the last
+    move to have failed, perhaps. Raises ``ValueError`` for marks of the wrong shape, or none.
+    """
+    goals = np.asarray(goals)
+    if goals.shape != (mdp.n_states,) or goals.dtype != bool or not goals.any():
+        raise ValueError(
+            f"goals must be a boolean array [{mdp.n_states}] that marks at least one state, "
+            f"got {goals.dtype} {goals.shape} with {int(goals.sum())} marked"
+        )
+    end = mdp.n_states
+    successors = np.asarray(mdp.successors)
+    arriving = goals[successors] & (successors != np.arange(end)[:, None, None])
+    successors = np.where(arriving, end, successors)
+    probabilities = np.asarray(mdp.probabilities)
+    last = np.zeros((1, *probabilities.shape[1:]))
+    last[0, 0, 0] = 1.0
+    available = np.asarray(mdp.available)
+    names = mdp.labels
+    ended = TabularMDP.from_successors(
+        np.concatenate([successors, np.full_like(successors[:1], end)]),
+        np.concatenate([probabilities, last]),
+        np.concatenate([np.asarray(mdp.features), np.zeros((1, mdp.n_actions, mdp.n_features))]),
+        initial=np.append(np.asarray(mdp.initial), 0.0),
+        discount=float(mdp.discount),
+        available=np.concatenate([available, np.arange(mdp.n_actions)[None] == 0]),
+    )
+    states = None if names.states is None else (*names.states, _new_name("end", names.states))
+    return replace(ended, labels=Labels(states, names.actions, names.features))
+
+
+def _new_name(name: str, taken: tuple[str, ...]) -> str:
+    """The name, numbered if it is taken."""
+    candidates = (name, *(f"{name} {i}" for i in range(2, len(taken) + 3)))
+    return next(candidate for candidate in candidates if candidate not in taken)
+
+
+def with_end(session: Demonstration, end: int) -> Demonstration:
+    """The session with the end state (the last of :func:`ending_at`) as the last step of each trajectory."""
+    n, width = session.kind.shape
+    longer = session.padded(n, width + 1)
+    rows, at = np.arange(n), longer.lengths
+    for array, value in zip(longer, (SEEN, end, UNKNOWN, np.nan), strict=True):
+        array[rows, at] = value
+    return longer

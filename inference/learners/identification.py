@@ -1,0 +1,202 @@
+"""What reports can tell about perception at all: who errs, the expert or the sensor?
+
+A report that fits badly is explained by an expert who errs as well as by a sensor that does. Where every pair
+that is reported could have happened, the likelihood of Eq. 6.5 hardly tells the two apart (and what it
+does tell may come from predicates that describe the sensor badly); scores, or knowing how decided the expert
+is, must. So the sensor is fitted twice to one demonstration: to an expert as erratic as was learned, and to
+one who always does what is best under the same reward. Where the two disagree, agreement is known only to
+lie between them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float
+
+from ...models.observation.demonstration import SEEN, Demonstration, DemonstrationError
+from ...models.observation.evidence import (
+    FeatureNoise,
+    Imperfection,
+    Sensor,
+    checked_demonstration,
+    fitting_sensor,
+    require_possible,
+)
+from ...models.process.mdp import TabularMDP
+from ...models.process.planning import deterministic_policy, hard_plan, reward_of, soft_plan
+from ..completion.smoothing import Evidence, smooth_all
+from ..programs.observation import Identification, unidentified_predicates
+from ..sensors.observations import report_classes, report_log_evidence
+from ..sensors.reliabilities import Perception, PreparedSession, entropic_perception, prepare
+from .noisy import DEFAULT_START, _first_logits
+
+# How often the decided expert still errs, so that nothing is ruled out.
+_ERRS = 1e-3
+_ITERATIONS = 100
+
+
+class SensorIdentification(NamedTuple):
+    """How far agreement depends on what is assumed of the expert.
+
+    Fields
+    ------
+    erratic : float ``[J]``
+        Agreement of reports with truths if the expert is as erratic as was learned.
+    decided : float ``[J]``
+        If he always does what is best under the learned reward.
+    structure : Identification
+        What no reports of this demonstration could tell, whoever errs.
+    tolerance : float
+        By how much the two may differ.
+    """
+
+    erratic: Float[np.ndarray, " J"]
+    decided: Float[np.ndarray, " J"]
+    structure: Identification
+    tolerance: float
+
+    @property
+    def identified(self) -> Bool[np.ndarray, " J"]:
+        """Whether a predicate's agreement is known, up to the tolerance."""
+        known: Bool[np.ndarray, " J"] = np.abs(self.erratic - self.decided) <= self.tolerance
+        known[list(self.structure.uninformative)] = False
+        return known
+
+    def describe(self, names: tuple[str, ...] | None = None) -> str:
+        """What cannot be told, in words; empty if everything can."""
+        called = [f"predicate {j}" if names is None else names[j] for j in range(len(self.erratic))]
+        lines = [
+            f"{called[j]}: not identified; reports agree in {self.decided[j]:.0%} of cases if the expert "
+            f"always does what is best, in {self.erratic[j]:.0%} if he errs as was learned"
+            for j in np.flatnonzero(~self.identified)
+            if j not in self.structure.uninformative
+        ]
+        structure = self.structure.describe(names)
+        return "; ".join([*lines, structure] if structure else lines)
+
+
+def sensor_identification(
+    mdp: TabularMDP,
+    predicates: ArrayLike,
+    demonstration: Demonstration,
+    weights: ArrayLike,
+    **options: Any,
+) -> SensorIdentification:
+    """Fit the sensor under the learned reward, to an erratic and to a decided expert.
+
+    Parameters
+    ----------
+    mdp, predicates
+        As of :func:`~i2rl.inference.rimeo`.
+    demonstration : Demonstration
+        To judge by, the more the better; needs no truth.
+    weights : float ``[K]``
+        The reward that was learned.
+    **options
+        Of :func:`sensor_identifier`, which is the better choice for many demonstrations.
+
+    Raises
+    ------
+    ValueError
+        For weights or predicates of the wrong shape, options that do not exist, and a demonstration in which
+        nothing was reported, or something that no truth could give.
+    """
+    return sensor_identifier(mdp, predicates, **options)(demonstration, weights)
+
+
+def sensor_identifier(
+    mdp: TabularMDP,
+    predicates: ArrayLike,
+    *,
+    view: Imperfection | None = None,
+    reportable: ArrayLike | None = None,
+    scores: str = "stepwise",
+    errors: float = 0.25,
+    tolerance: float = 0.05,
+) -> Callable[[Demonstration, ArrayLike], SensorIdentification]:
+    """:func:`sensor_identification` of many demonstrations, compiled once for each of their shapes.
+
+    ``view``, ``reportable``, ``scores`` and ``errors`` are those of :func:`~i2rl.inference.rimeo`; agreement
+    may differ by ``tolerance`` and still be called identified.
+    """
+    if scores not in ("stepwise", "averaged", "none"):
+        raise ValueError(f"scores must be one of stepwise, averaged, none, got {scores!r}")
+    if not 0 <= errors < np.inf:
+        raise ValueError(f"errors must be a number of reports, not negative, got {errors}")
+    psi = np.asarray(predicates)
+    if psi.ndim != 3 or psi.shape[1:] != mdp.available.shape:
+        raise ValueError(
+            f"predicates have shape [J, S, A] = [J, {mdp.n_states}, {mdp.n_actions}], got {list(psi.shape)}"
+        )
+    seen: Imperfection = Sensor() if view is None else Sensor() * view
+    if seen.reading is not None:
+        raise ValueError("the view says what is hidden; how reports err is fitted, not given")
+    seen = fitting_sensor(seen, mdp)
+    mask = None if reportable is None else np.asarray(reportable, bool)
+    classes = report_classes(psi, mask)
+    perception = entropic_perception(classes, scores, "posterior", errors, 1.0)
+    fit = _fit(mdp, perception, seen.presence, _first_logits(psi, DEFAULT_START))
+    slips = mdp.available / mdp.available.sum(1, keepdims=True)
+
+    def identify(demonstration: Demonstration, weights: ArrayLike) -> SensorIdentification:
+        w = np.asarray(weights, float)
+        if w.shape != (mdp.n_features,):
+            raise ValueError(f"weights have shape [K] = [{mdp.n_features}], got {list(w.shape)}")
+        if not np.isfinite(w).all():
+            raise ValueError(f"weights must be numbers, got {w}")
+        demonstration = checked_demonstration(mdp, demonstration)
+        if not (demonstration.kind == SEEN).any():
+            raise DemonstrationError("nothing was reported: there is nothing to judge the sensor by")
+        session = prepare(mdp, classes, demonstration.bucketed(), perception.scored)
+        reward = reward_of(mdp, jnp.asarray(w))
+        best = deterministic_policy(hard_plan(mdp, reward).optimal)
+        decided = (1 - _ERRS) * best + _ERRS * slips
+        (erratic, likely), (sure, _) = (
+            fit(session, policy) for policy in (soft_plan(mdp, reward).log_policy, jnp.log(decided))
+        )
+        if not np.isfinite(likely).all():
+            require_possible(FeatureNoise(psi, np.full(len(psi), 0.5), mask) * seen, mdp, demonstration)
+            raise DemonstrationError("a trajectory has probability zero under the learned policy")
+        # Wherever this expert may be: what differs nowhere cannot be told.
+        structure = unidentified_predicates(psi, np.asarray(decided), reportable)
+        return SensorIdentification(np.asarray(erratic), np.asarray(sure), structure, tolerance)
+
+    return identify
+
+
+def _fit(
+    mdp: TabularMDP,
+    perception: Perception,
+    presence: Float[Array, " S"] | None,
+    first_logits: Float[Array, " J"],
+) -> Callable[[PreparedSession, Float[Array, "S A"]], tuple[Float[Array, " J"], Float[Array, " n"]]]:
+    """Agreement after the alternation of truths and sensor, the expert's behaviour being given.
+
+    With the log-likelihood of each trajectory.
+    """
+
+    @jax.jit
+    def fit(
+        session: PreparedSession, log_policy: Float[Array, "S A"]
+    ) -> tuple[Float[Array, " J"], Float[Array, " n"]]:
+        confidence = perception.confidence(perception.empty, session.reports)
+
+        def step(_: int, carry: tuple) -> tuple:
+            logits = carry[0]
+            evidence = report_log_evidence(perception.classes, logits, session.reports, confidence, presence)
+            truths = smooth_all(mdp, log_policy, Evidence(evidence, session.live))
+            heard = perception.summarise(logits, session, confidence, truths.pairs)
+            logits = perception.fit(heard, logits)
+            return logits, perception.agreement(logits, heard), truths.log_likelihood
+
+        begun = first_logits, jnp.zeros_like(first_logits), jnp.zeros(len(session.live))
+        return lax.fori_loop(0, _ITERATIONS, step, begun)[1:]
+
+    return fit

@@ -1,0 +1,213 @@
+"""The incremental method of Jin et al. (2011) as an online learner: a reward corrected by every mistake.
+
+A session is one state-action pair (section 3.2). Solve the MDP with the reward so far; where the expert did
+something else than the predicted optimal action, move the reward towards making it right,
+``R^i = R^{i-1} + alpha v_i``. Nothing but the reward is carried on: the method has no sufficient statistic
+(Table 8.1).
+
+The dissertation calls ``v_i`` "the difference in the expected value of the observed action and the
+(predicted) optimal action". Added to a reward it must be a vector: it is read here as the gradient of that
+difference in the reward, ``v_i = d/dR [Q(s, a) - Q(s, a*)]`` under the predicted policy, which is the
+difference between the expected discounted visits after the one and after the other. The difference of
+values itself is ``v_i . R`` (values are linear in the reward), and what is added is the mistake-driven
+step of a perceptron, which the paper's bound on the number of mistakes is about.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ...models.inputs.arguments import as_key
+from ...models.observation.demonstration import SEEN, UNKNOWN, Demonstration, DemonstrationError
+from ...models.observation.evidence import checked_demonstration
+from ...models.process.mdp import Labels, TabularMDP
+from ...models.process.planning import (
+    deterministic_policy,
+    hard_plan,
+    occupancy,
+    require_discounted,
+    reward_of,
+)
+from ..sessions.scaling import on_scaled_features
+from ..sessions.session import Learner, Report
+
+
+class JinState(NamedTuple):
+    """What the method carries on: ``weights [K]``, the reward; an empty statistic; sessions so far."""
+
+    weights: Float[Array, " K"]
+    statistic: tuple[()]
+    session: Int[Array, ""]
+
+
+class Correction(NamedTuple):
+    """What a pair says about a reward: ``direction [K]`` (``v_i``) and whether the prediction was wrong."""
+
+    direction: Float[Array, " K"]
+    mistaken: Bool[Array, ""]
+
+
+def with_state_features(mdp: TabularMDP) -> TabularMDP:
+    """The same process with one feature a state, its indicator: weights are then a reward table ``R [S]``.
+
+    Every tool that takes an MDP and weights so works on reward tables. A reward of the actions, such as a
+    price of turning, is beyond what such a table can say.
+    """
+    indicators = jnp.eye(mdp.n_states)[:, None, :] * mdp.available[:, :, None]
+    labels = Labels(mdp.labels.states, mdp.labels.actions, mdp.state_names)
+    return replace(mdp, features=indicators, labels=labels)
+
+
+def reward_correction(
+    mdp: TabularMDP, weights: Float[Array, " K"], state: Int[Array, ""], action: Int[Array, ""]
+) -> Correction:
+    """``v_i`` of one observed pair: how the value of its action, less that of the predicted one, grows.
+
+    ``direction = phi(s, a) - phi(s, a*) + gamma (P(.|s, a) - P(.|s, a*)) . mu``, with ``mu`` the expected
+    discounted features under the optimal policy for ``weights`` (its first optimal action in every state).
+    Zero where the observed action is the predicted one.
+    """
+    policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, weights)).optimal)
+    predicted = jnp.argmax(policy[state])
+    # Occupancy is linear in the distribution it starts from: one solve gives both expectations' difference.
+    apart = (
+        jnp.zeros(mdp.n_states)
+        .at[mdp.successors[state, action]].add(mdp.probabilities[state, action])
+        .at[mdp.successors[state, predicted]].add(-mdp.probabilities[state, predicted])
+    )  # fmt: skip
+    later = jnp.einsum("sa,sak->k", occupancy(mdp, policy, apart), mdp.features)
+    now = mdp.features[state, action] - mdp.features[state, predicted]
+    return Correction(now + mdp.discount * later, predicted != action)
+
+
+def jin_i2rl(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner:
+    """Jin et al.'s online IRL: a reward table over states, corrected by each pair that was predicted wrongly.
+
+    A session of one pair is the method's own (section 3.2); a demonstration of several steps is gone
+    through pair by pair, with the same result as a session each. Steps that are not seen in full, state and
+    action, say nothing here and are passed over: the method is one for full observability. The reward
+    starts at ``1 / sqrt(S)`` in every state, where all actions are worth the same. The prediction is
+    therefore *one* optimal action, the first of the MDP, and any other is a mistake: were ties forgiven,
+    the first reward would never be left.
+
+    ``learner.mdp`` is :func:`with_state_features` of ``mdp``, of which ``weights`` are the reward table.
+    All that ``alpha`` does is to scale that table: what is added sums to zero and depends on the policy
+    alone, and neither a constant nor the scale changes a policy. No learning rate is better than another
+    (up to the tolerance of ties).
+
+    Parameters
+    ----------
+    mdp : TabularMDP
+        The expert's process, discount below 1.
+    learning_rate : float
+        ``alpha > 0``.
+
+    Returns
+    -------
+    Learner
+        In its reports ``iterations`` are the pairs looked at, ``solver_iterations`` the mistakes among them
+        and ``gradient`` is ``|sum v_i|``; likelihoods are NaN, as the method states no probabilities. Its
+        ``update`` raises :class:`DemonstrationError` naming trajectory and step for an action that its
+        state does not have; in a fleet such a session changes nothing and reports minus infinity.
+
+    Raises
+    ------
+    ValueError
+        For discount 1 or a learning rate that is not positive.
+    """
+    return _learner("Jin et al.", with_state_features(mdp), learning_rate)
+
+
+def jin_i2rl_with_features(mdp: TabularMDP, *, learning_rate: float = 0.3) -> Learner:
+    """The same corrections to the weights of ``mdp``'s own features; parameters as for :func:`jin_i2rl`.
+
+    A control: what the method reaches where the features of the domain are given to it as to the others.
+    Scaled weights (:mod:`~i2rl.models.process.units`) start at ``1 / sqrt(K)``, and corrections are of them,
+    so here the learning rate matters; the default is what ``i2rl run methods`` finds good on the second
+    patrol.
+    """
+    return on_scaled_features(mdp, lambda scaled: _learner("Jin et al. with features", scaled, learning_rate))
+
+
+def _learner(name: str, mdp: TabularMDP, learning_rate: float) -> Learner:
+    require_discounted(mdp)
+    if not 0 < learning_rate < math.inf:
+        raise ValueError(f"the learning rate must be a positive number, got {learning_rate}")
+    rate = jnp.asarray(learning_rate, float)
+
+    def init(key: Array) -> JinState:
+        as_key(key)  # unused: the first reward is fixed
+        size = mdp.n_features
+        return JinState(jnp.full(size, 1 / math.sqrt(size)), (), jnp.zeros((), int))
+
+    def session(state: JinState, demonstration: Demonstration) -> tuple[JinState, Report]:
+        return _session(mdp, rate, state, demonstration)
+
+    def update(state: JinState, demonstration: Demonstration) -> tuple[JinState, Report]:
+        began = time.perf_counter()
+        demonstration = checked_demonstration(mdp, demonstration)
+        _require_available(mdp, demonstration)
+        new, report = session(state, demonstration.bucketed())
+        return new, report.in_plain_numbers(time.perf_counter() - began)
+
+    return Learner(name, mdp, {"learning_rate": learning_rate}, init, update, session)
+
+
+@jax.jit
+def _session(
+    mdp: TabularMDP, rate: Float[Array, ""], state: JinState, demonstration: Demonstration
+) -> tuple[JinState, Report]:
+    kind, states, actions = (jnp.asarray(x).reshape(-1) for x in demonstration[:3])
+    full = (kind == SEEN) & (states != UNKNOWN) & (actions != UNKNOWN)
+    in_range = (states >= 0) & (states < mdp.n_states) & (actions >= 0) & (actions < mdp.n_actions)
+
+    def look(carry: tuple, pair: tuple) -> tuple:
+        s, a, usable = pair
+
+        def learn() -> tuple:
+            weights, mistakes = carry
+            found = reward_correction(mdp, weights, s, a)
+            step = jnp.where(found.mistaken, rate, 0.0) * found.direction
+            return weights + step, mistakes + found.mistaken
+
+        return lax.cond(usable, learn, lambda: carry), None
+
+    begin = (state.weights, jnp.zeros((), int))
+    (weights, mistakes), _ = lax.scan(look, begin, (states, actions, full))
+    possible = jnp.all(~full | (in_range & mdp.available[states, actions]))
+    learned = JinState(weights, (), state.session + 1)
+    report: dict[str, Any] = {
+        "session": state.session + 1,
+        "log_likelihood": jnp.where(possible, jnp.nan, -jnp.inf),
+        "demonstration_log_likelihood": jnp.where(possible, jnp.nan, -jnp.inf),
+        "gradient": jnp.linalg.norm(weights - state.weights) / rate,
+        "iterations": jnp.sum(full),
+        "solver_iterations": mistakes,
+        "converged": jnp.array(True),
+        "seconds": jnp.array(jnp.nan),
+        "weights": weights,
+    }
+    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), learned, state), Report(**report)
+
+
+def _require_available(mdp: TabularMDP, demonstration: Demonstration) -> None:
+    kind, states, actions, _ = demonstration
+    full = (kind == SEEN) & (states != UNKNOWN) & (actions != UNKNOWN)
+    if not full.any():
+        raise DemonstrationError("a session needs at least one step seen in full, its state and its action")
+    missing = full & ~np.asarray(mdp.available)[np.where(full, states, 0), np.where(full, actions, 0)]
+    if missing.any():
+        i, t = np.argwhere(missing)[0]
+        raise DemonstrationError(
+            f"trajectory {i}, step {t}: state {mdp.state_names[states[i, t]]} has no action "
+            f"{mdp.action_names[actions[i, t]]}"
+        )

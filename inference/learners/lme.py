@@ -1,0 +1,610 @@
+"""Latent maximum-entropy IRL (chapter 4): learning from partly hidden demonstrations, online and in batch.
+
+A session alternates the E-step (completion under the current policy) and the M-step (a maximum-entropy
+program started at the current weights): Algorithm 1, with its sampling carried out exactly and its
+exponentiated gradient, which can express neither negative weights nor a sharper expert, replaced.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+
+from ...models.inputs.arguments import as_key
+from ...models.laws.chain import Smoothed
+from ...models.observation.demonstration import SEEN as SEEN_STEP
+from ...models.observation.demonstration import Demonstration, DemonstrationError
+from ...models.observation.evidence import (
+    Imperfection,
+    Sensor,
+    checked_demonstration,
+    fitting_sensor,
+    require_possible,
+)
+from ...models.process.mdp import TabularMDP
+from ...models.process.planning import SoftPlan, require_discounted, reward_of, soft_plan
+from ...models.process.units import feature_scale, with_scaled_features
+from ..completion.smoothing import Evidence, blocked_posterior, evidence_of, gibbs_posterior, smooth_all
+from ..programs.constraints import FeatureTarget
+from ..programs.maximum_entropy import (
+    Solution,
+    WarmStart,
+    exponentiate_scaled,
+    fit_scaled_counts,
+    solve_scaled_dual,
+)
+from ..sessions.scaling import on_scaled_features
+from ..sessions.schedule import Schedule, described, program_slack, require_slack, require_slack_in
+from ..sessions.session import Learner, Report
+from ..sessions.statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
+
+# Nats per trajectory and unit of scaled weight. Smaller lets nearly deterministic experts be nearly so.
+DEFAULT_SLACK = 0.002
+# Lemma 2 with eps_s = 0.05 and delta_s = 0.1 for six features (section 7.4.1).
+DEFAULT_DRAWS = 957
+
+
+class LMEState(NamedTuple):
+    """What LME-I2RL carries from session to session (Definition 7).
+
+    Fields
+    ------
+    weights : float ``[K]``
+        The reward estimate ``theta^i``.
+    statistic : FeatureStatistic or CountStatistic
+        The sufficient statistic, a running average over all trajectories so far.
+    values : float ``[S]``
+        Soft values of ``weights``: planning's warm start.
+    program : tuple
+        The solver's own warm start, empty for solvers that start from weights and values.
+    session : int
+        Sessions so far.
+    key : random key
+    """
+
+    weights: Float[Array, " K"]
+    statistic: Any
+    values: Float[Array, " S"]
+    program: Any
+    session: Int[Array, ""]
+    key: Array
+
+
+class _Iterate(NamedTuple):
+    """One point of the EM iteration."""
+
+    weights: Float[Array, " K"]
+    values: Float[Array, " S"]
+    change: Float[Array, ""]
+    gradient: Float[Array, ""]
+    iterations: Int[Array, ""]
+    solver_iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
+    key: Array
+
+
+class _Method(NamedTuple):
+    """What the parts of a session need to know."""
+
+    mdp: TabularMDP
+    sensor: Imperfection
+    statistic: Statistic
+    completion: Callable[[Array, TabularMDP, Float[Array, "S A"], Evidence], Smoothed]
+    slack: Schedule
+    ridge: float
+
+    def plan(self, weights: Float[Array, " K"], values: Float[Array, " S"]) -> SoftPlan:
+        return soft_plan(self.mdp, reward_of(self.mdp, weights), values)
+
+    def e_step(self, key: Array, plan: SoftPlan, evidence: Evidence, seen: Bool[Array, "n L"]) -> Any:
+        posterior = self.completion(key, self.mdp, plan.log_policy, evidence)
+        return complete(self.mdp, posterior, evidence.live, seen)
+
+    def working(self, kept: Any, key: Array, plan: SoftPlan, evidence: Evidence, seen: Array) -> tuple:
+        """What the M-step fits, and the session's exact log-likelihood under ``plan``.
+
+        It fits the carried statistic and the current session, completed under ``plan``.
+        """
+        completed = self.e_step(key, plan, evidence, seen)
+        working = blend(kept, self.statistic.of_session(self.mdp, plan, completed))
+        return working, jnp.sum(completed.expectations.log_likelihood)
+
+    def gradient(self, weights: Float[Array, " K"], values: Float[Array, " S"], working: Any) -> Array:
+        """Norm of the log-likelihood's gradient; ``|phi_hat - E[phi]|`` with the ``features`` statistic."""
+
+        def likelihood(w: Float[Array, " K"]) -> Float[Array, ""]:
+            return self.statistic.log_likelihood(self.mdp, w, self.plan(w, values).values, working)
+
+        return jnp.linalg.norm(jax.grad(likelihood)(weights))
+
+    def penalties(self, statistic: Any, session: Int[Array, ""]) -> tuple:
+        """Slack of the program in a session, and the prior's precision per trajectory."""
+        slack = program_slack(self.slack, session, self.statistic.slack(self.mdp, 1.0))
+        return slack, self.ridge / jnp.maximum(statistic.size, 1.0)
+
+
+def lme_i2rl(
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    *,
+    statistic: str = "seen",
+    completion: str = "exact",
+    solver: str = "newton",
+    slack: Schedule = DEFAULT_SLACK,
+    ridge: float = 0.0,
+    draws: int = DEFAULT_DRAWS,
+    iterations: int = 10,
+    tolerance: float = 1e-3,
+    name: str = "LME-I2RL",
+) -> Learner:
+    """Online latent maximum-entropy IRL (Algorithm 1).
+
+    Parameters
+    ----------
+    mdp : TabularMDP
+        The expert's process without its reward; discount below 1.
+    sensor : Imperfection
+        What the learner cannot see and what it may misread.
+    statistic : {"seen", "counts", "features"}
+        What is kept of a session; see :mod:`i2rl.inference.sessions.statistic`.
+    completion : {"exact", "blocked", "gibbs"}
+        The E-step: exact, or estimated from ``draws`` samples.
+    solver : {"newton", "ipopt", "cvxpy", "exponentiated gradient"}
+        The M-step: proximal Newton in JAX; the CasADi program with IPOPT, warm-started from the last
+        session; the CVXPY primal; the normalised exponentiated gradient as printed. The last two solve the
+        program of the ``features`` statistic only.
+    slack : float or function of the session's number
+        Relaxation ``epsilon`` of the matching constraint: an L1 penalty of ``slack`` nats per trajectory on
+        scaled weights, rewards in nats that each feature adds at most (:mod:`~i2rl.models.process.units`)
+        (``slack / (1 - gamma)`` with the ``features`` statistic, as in Theorem 1). Or a schedule, as in
+        Optax: a function that JAX can trace from the session's number, counted from 1, to it;
+        :class:`~i2rl.inference.sessions.schedule.Harmonic` is that of the no-regret theorem (Eq. 4.3).
+    ridge : float
+        Precision of a Gaussian prior on the scaled weights (nats in all, not per trajectory); for the newton
+        and ipopt solvers.
+    iterations, tolerance : int, float
+        A session ends after so many E- and M-steps, or when no scaled weight moves by more than
+        ``tolerance`` relative to the largest.
+
+    Returns
+    -------
+    Learner
+        Its ``update`` raises :class:`DemonstrationError` naming trajectory and step for an observation the
+        model rules out, and ``ValueError`` where a schedule turns negative; the state it was given stays
+        valid.
+
+    Raises
+    ------
+    ValueError
+        For discount 1, an unknown option, or a slack that is negative or no number.
+    """
+    require_discounted(mdp)
+    sensor = fitting_sensor(sensor, mdp)
+
+    def build(mdp: TabularMDP) -> Learner:
+        method = _method(mdp, sensor, statistic, completion, slack, ridge, draws)
+        configuration = {
+            "statistic": statistic, "completion": completion, "solver": solver, "slack": described(slack),
+            "ridge": ridge,
+            "draws": draws if completion != "exact" else 0, "iterations": iterations, "tolerance": tolerance,
+            "sensor": _digest(sensor),
+        }  # fmt: skip
+        start = partial(_carried_on, method)
+        return _learner(name, method, start, solver, iterations, tolerance, configuration)
+
+    return on_scaled_features(mdp, build)
+
+
+def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Learner:
+    """LME-I2RL that forgets its weights: every session starts from fresh random ones (section 7.3).
+
+    A control for what passing the weights on is worth. Options as for :func:`lme_i2rl`.
+    """
+    sensor = fitting_sensor(sensor, mdp)
+    carried = lme_i2rl(mdp, sensor, name="LME-I2RL with random weights", **options)
+    configuration = carried.configuration
+
+    def build(mdp: TabularMDP) -> Learner:
+        method = _method(
+            mdp, sensor, configuration["statistic"], configuration["completion"],
+            options.get("slack", DEFAULT_SLACK), configuration["ridge"], configuration["draws"],
+        )  # fmt: skip
+        start = partial(_started_afresh, method)
+        return _learner(
+            carried.name, method, start, configuration["solver"], configuration["iterations"],
+            configuration["tolerance"], configuration,
+        )  # fmt: skip
+
+    return on_scaled_features(mdp, build)
+
+
+def me_i2rl(mdp: TabularMDP, **options: Any) -> Learner:
+    """Online maximum-entropy IRL under full observability; options as for :func:`lme_i2rl`.
+
+    Theorem 1 is about the program that ``statistic="features"`` solves.
+    """
+    return lme_i2rl(mdp, Sensor(), name="ME-I2RL", **options)
+
+
+# -- building blocks ----------------------------------------------------------------------------------
+
+
+def _method(
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    statistic: str,
+    completion: str,
+    slack: Schedule,
+    ridge: float,
+    draws: int,
+) -> _Method:
+    samplers = {"blocked": blocked_posterior, "gibbs": gibbs_posterior}
+    if statistic not in STATISTICS:
+        raise ValueError(f"statistic must be one of {', '.join(STATISTICS)}, got {statistic!r}")
+    if completion != "exact" and completion not in samplers:
+        raise ValueError(f"completion must be exact, blocked or gibbs, got {completion!r}")
+    if completion != "exact" and draws < 1:
+        raise ValueError(f"a sampled completion needs at least one draw, got {draws}")
+    require_slack(slack)
+    if not ridge >= 0:
+        raise ValueError(f"ridge must not be negative, got {ridge}")
+
+    def exact(key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Smoothed:
+        del key
+        return smooth_all(mdp, log_policy, evidence)
+
+    complete_with = exact if completion == "exact" else partial(samplers[completion], draws=draws)
+    return _Method(mdp, sensor, STATISTICS[statistic], complete_with, slack, ridge)
+
+
+def _digest(sensor: Imperfection) -> str:
+    """Identifies a sensor in a configuration."""
+    digest = hashlib.sha256(type(sensor).__name__.encode())
+    for leaf in jax.tree.leaves(sensor):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()[:16]
+
+
+def _random_weights(key: Array, mdp: TabularMDP) -> Float[Array, " K"]:
+    """``theta^0_k ~ uniform(0, 1)``, scaled (Algorithm 1, line 2)."""
+    return jax.random.uniform(key, (mdp.n_features,), float)
+
+
+def _carried_on(method: _Method, key: Array, state: LMEState) -> tuple:
+    del key
+    return state.weights, state.values
+
+
+def _started_afresh(method: _Method, key: Array, state: LMEState) -> tuple:
+    return _random_weights(key, method.mdp), jnp.zeros_like(state.values)
+
+
+def _newton(mdp: TabularMDP, statistic: Any, slack: Array, ridge: Array, start: WarmStart) -> Solution:
+    if isinstance(statistic, FeatureStatistic):
+        target = FeatureTarget(statistic.features, statistic.start)
+        return solve_scaled_dual(mdp, target, slack, ridge, start)
+    return fit_scaled_counts(mdp, statistic.counts, slack, ridge, start)
+
+
+def _exponentiated(mdp: TabularMDP, statistic: Any, slack: Array, ridge: Array, start: WarmStart) -> Solution:
+    del ridge  # the printed update has no prior
+    target = FeatureTarget(statistic.features, statistic.start)
+    return exponentiate_scaled(mdp, target, slack * (1 - mdp.discount), start=start.weights)
+
+
+def _em(
+    method: _Method,
+    m_step: Callable[..., Solution],
+    iterations: int,
+    tolerance: float,
+    session: Int[Array, ""],
+    kept: Any,
+    evidence: Evidence,
+    seen: Bool[Array, "n L"],
+    key: Array,
+    weights: Float[Array, " K"],
+    values: Float[Array, " S"],
+) -> _Iterate:
+    """E- and M-steps of the session with this number in one compiled loop."""
+
+    def step(point: _Iterate) -> _Iterate:
+        key, sample = jax.random.split(point.key)
+        plan = method.plan(point.weights, point.values)
+        working, _ = method.working(kept, sample, plan, evidence, seen)
+        solution = m_step(
+            method.mdp, working, *method.penalties(working, session), WarmStart(point.weights, plan.values)
+        )
+        gradient = lax.cond(
+            point.iterations == 0,
+            lambda: method.gradient(point.weights, plan.values, working),
+            lambda: point.gradient,
+        )
+        return _Iterate(
+            solution.weights, solution.values, _change(point.weights, solution.weights), gradient,
+            point.iterations + 1, point.solver_iterations + solution.iterations, solution.converged, key,
+        )  # fmt: skip
+
+    def unfinished(point: _Iterate) -> Bool[Array, ""]:
+        return (point.change > tolerance) & (point.iterations < iterations)
+
+    zero = jnp.zeros((), int)
+    unsolved = jnp.array(False)
+    first = _Iterate(weights, values, jnp.array(jnp.inf), jnp.array(jnp.inf), zero, zero, unsolved, key)
+    return lax.while_loop(unfinished, step, first)
+
+
+def _change(old: Float[Array, " K"], new: Float[Array, " K"]) -> Float[Array, ""]:
+    return jnp.max(jnp.abs(new - old)) / (1e-3 + jnp.max(jnp.abs(new)))
+
+
+def _close(
+    method: _Method,
+    state: LMEState,
+    point: _Iterate,
+    program: Any,
+    evidence: Evidence,
+    seen: Bool[Array, "n L"],
+) -> tuple[LMEState, Report]:
+    """End a session: complete its demonstration once more, under its own result, and keep the statistic."""
+    mdp, statistic = method.mdp, method.statistic
+    key, sample = jax.random.split(point.key)
+    plan = method.plan(point.weights, point.values)
+    completed = method.e_step(sample, plan, evidence, seen)
+    new = statistic.to_keep(mdp, plan, completed)
+    own = jnp.sum(completed.expectations.log_likelihood)
+    kept = blend(state.statistic, new)
+    fields: dict[str, Any] = {
+        "session": state.session + 1,
+        "log_likelihood": statistic.log_likelihood(mdp, point.weights, plan.values, kept),
+        "demonstration_log_likelihood": own,
+        "gradient": point.gradient,
+        "iterations": point.iterations,
+        "solver_iterations": point.solver_iterations,
+        "converged": point.converged,
+        "seconds": jnp.array(jnp.nan),
+        "weights": point.weights,
+    }
+    learned = LMEState(point.weights, kept, plan.values, program, state.session + 1, key)
+    # An observation that cannot be must not spoil what was learned (a fleet raises nothing).
+    possible = jnp.isfinite(own)
+    state = jax.tree.map(partial(jnp.where, possible), learned, state._replace(program=program))
+    return state, Report(**fields)
+
+
+def _learner(
+    name: str,
+    method: _Method,
+    start: Callable[[Array, LMEState], tuple],
+    solver: str,
+    iterations: int,
+    tolerance: float,
+    configuration: Mapping[str, Any],
+) -> Learner:
+    mdp = method.mdp
+    in_jax = {"newton": _newton, "exponentiated gradient": _exponentiated}
+    if solver not in (*in_jax, "ipopt", "cvxpy"):
+        raise ValueError(f"solver must be newton, ipopt, cvxpy or exponentiated gradient, got {solver!r}")
+    if solver in ("cvxpy", "exponentiated gradient"):
+        if method.statistic.name != "features":
+            raise ValueError(f"the {solver} solver needs the features statistic, not {method.statistic.name}")
+        if method.ridge > 0:
+            raise ValueError(f"the {solver} solver has no ridge: use newton or ipopt with a prior")
+    if iterations < 1:
+        raise ValueError(f"a session needs at least one iteration, got {iterations}")
+
+    def begin(state: LMEState, demonstration: Demonstration) -> tuple:
+        evidence = evidence_of(mdp, method.sensor, demonstration)
+        seen = jnp.asarray(demonstration.kind) == SEEN_STEP
+        key, fresh = jax.random.split(state.key)
+        return evidence, seen, key, *start(fresh, state)
+
+    run: Callable[[LMEState, Demonstration], tuple[LMEState, Report]]
+    if solver in in_jax:
+
+        def session(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
+            evidence, seen, key, weights, values = begin(state, demonstration)
+            point = _em(
+                method,
+                in_jax[solver],
+                iterations,
+                tolerance,
+                state.session + 1,
+                state.statistic,
+                evidence,
+                seen,
+                key,
+                weights,
+                values,
+            )
+            return _close(method, state, point, state.program, evidence, seen)
+
+        run = jax.jit(session)
+        empty_program: Any = ()
+    else:
+        from ..programs.host import host_solver
+
+        solve, empty_program = host_solver(mdp, solver, method.statistic.name)
+        opening = jax.jit(begin)
+        closing = jax.jit(partial(_close, method))
+
+        @jax.jit
+        def expectation(
+            state: LMEState, key: Array, weights: Array, values: Array, evidence: Evidence, seen: Array
+        ) -> tuple:
+            key, sample = jax.random.split(key)
+            plan = method.plan(weights, values)
+            working, own = method.working(state.statistic, sample, plan, evidence, seen)
+            gradient = method.gradient(weights, plan.values, working)
+            return key, plan.values, own, gradient, working, *method.penalties(working, state.session + 1)
+
+        def run(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
+            evidence, seen, key, weights, values = opening(state, demonstration)
+            program, total, steps, change, converged = state.program, 0, 0, np.inf, False
+            first = jnp.array(jnp.nan)
+            while steps < iterations and change > tolerance:
+                key, values, own, gradient, working, slack, ridge = expectation(
+                    state._replace(program=()), key, weights, values, evidence, seen
+                )
+                if not np.isfinite(own):  # no program to solve: update says which step cannot be
+                    break
+                first = gradient if steps == 0 else first
+                solution, program = solve(working, slack, ridge, program)
+                change = float(_change(weights, jnp.asarray(solution.weights)))
+                weights, values = jnp.asarray(solution.weights), jnp.asarray(solution.values)
+                total, steps = total + int(solution.iterations), steps + 1
+                converged = solution.converged
+            counted = (
+                jnp.array(change),
+                first,
+                jnp.array(steps),
+                jnp.array(total),
+                jnp.array(converged),
+            )
+            point = _Iterate(weights, values, *counted, key)
+            return closing(state, point, program, evidence, seen)
+
+    def init(key: Array) -> LMEState:
+        key, fresh = jax.random.split(as_key(key))
+        weights = _random_weights(fresh, mdp)
+        return LMEState(
+            weights,
+            method.statistic.empty(mdp),
+            jnp.zeros(mdp.n_states),
+            empty_program,
+            jnp.zeros((), int),
+            key,
+        )
+
+    def update(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
+        began = time.perf_counter()
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="a session")
+        require_slack_in(method.slack, int(state.session) + 1)
+        new, report = run(state, demonstration.bucketed())
+        if not np.isfinite(report.demonstration_log_likelihood):
+            require_possible(method.sensor, mdp, demonstration)
+            raise DemonstrationError("a trajectory has probability zero under the current policy")
+        return new, report.in_plain_numbers(time.perf_counter() - began)
+
+    @jax.jit
+    def likelihood(state: LMEState, weights: Float[Array, " K"]) -> Float[Array, ""]:
+        values = method.plan(weights, state.values).values
+        return method.statistic.log_likelihood(mdp, weights, values, state.statistic)
+
+    def log_likelihood(state: LMEState, weights: Float[Array, " K"]) -> float:
+        return float(likelihood(state, jnp.asarray(weights, float)))
+
+    return Learner(
+        name, mdp, configuration, init, update, session if solver in in_jax else None, log_likelihood
+    )
+
+
+# -- batch --------------------------------------------------------------------------------------------
+
+
+class BatchFit(NamedTuple):
+    """Result of batch LME.
+
+    Fields
+    ------
+    weights : float ``[K]``
+        Of the best restart.
+    log_likelihood : float
+        Exact log-likelihood of the demonstration, nats per trajectory.
+    objective : float ``[restarts]``
+        Penalised log-likelihood (per trajectory) reached from each start.
+    iterations : int ``[restarts]``
+        E- and M-steps of each.
+    converged : bool ``[restarts]``
+        Whether each one's last program met its tolerance.
+    """
+
+    weights: Float[np.ndarray, " K"]
+    log_likelihood: float
+    objective: Float[np.ndarray, " restarts"]
+    iterations: Int[np.ndarray, " restarts"]
+    converged: Bool[np.ndarray, " restarts"]
+
+
+class Batch(NamedTuple):
+    """Batch LME on one decision process; ``fit(key, demonstration)`` uses all trajectories at once."""
+
+    name: str
+    fit: Callable[[Array, Demonstration], BatchFit]
+
+
+def batch_lme(
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    *,
+    restarts: int = 3,
+    slack: float = DEFAULT_SLACK,
+    ridge: float = 0.0,
+    iterations: int = 500,
+    tolerance: float = 1e-3,
+) -> Batch:
+    """Batch latent maximum-entropy IRL: EM over all trajectories from several random starts, best one kept.
+
+    Parameters as for :func:`lme_i2rl`, but without sessions ``slack`` is a number. ``fit`` raises
+    :class:`DemonstrationError` for an observation the model rules out.
+    """
+    require_discounted(mdp)
+    if restarts < 1 or iterations < 1:
+        raise ValueError(f"restarts and iterations must be at least 1, got {restarts} and {iterations}")
+    if callable(slack):
+        raise ValueError("batch learning has no sessions, so its slack must be a number, not a schedule")
+    sensor = fitting_sensor(sensor, mdp)
+    given, mdp = mdp, with_scaled_features(mdp)
+    scale = np.asarray(feature_scale(given))
+    method = _method(mdp, sensor, "counts", "exact", slack, ridge, 0)
+
+    @jax.jit
+    def fit(key: Array, demonstration: Demonstration) -> tuple:
+        evidence = evidence_of(mdp, sensor, demonstration)
+        seen = jnp.asarray(demonstration.kind) == SEEN_STEP
+        kept = method.statistic.empty(mdp)
+
+        def from_start(key: Array) -> tuple:
+            weights = _random_weights(key, mdp)
+            point = _em(
+                method,
+                _newton,
+                iterations,
+                tolerance,
+                jnp.ones((), int),
+                kept,
+                evidence,
+                seen,
+                key,
+                weights,
+                jnp.zeros(mdp.n_states),
+            )
+            plan = method.plan(point.weights, point.values)
+            expectations = method.e_step(key, plan, evidence, seen).expectations
+            size = jnp.maximum(expectations.size, 1.0)
+            average = jnp.sum(expectations.log_likelihood) / size
+            penalty = slack * jnp.sum(jnp.abs(point.weights)) + ridge / size / 2 * jnp.sum(point.weights**2)
+            return point.weights, average, average - penalty, point.iterations, point.converged
+
+        # One start after another: memory stays that of one, and no start waits for the slowest.
+        return lax.map(from_start, jax.random.split(key, restarts))
+
+    def checked(key: Array, demonstration: Demonstration) -> BatchFit:
+        key = as_key(key)
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="batch learning")
+        weights, average, objective, *counted = (np.asarray(x) for x in fit(key, demonstration.bucketed()))
+        if not np.isfinite(objective).any():
+            require_possible(sensor, mdp, demonstration)
+            raise DemonstrationError("a trajectory has probability zero under every start")
+        best = int(np.nanargmax(objective))
+        return BatchFit(weights[best] / scale, float(average[best]), objective, *counted)
+
+    return Batch("batch LME", checked)

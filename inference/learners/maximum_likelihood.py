@@ -1,0 +1,316 @@
+"""Maximum-likelihood IRL of Boltzmann experts, of one task and of several.
+
+MLIRL (Vroman 2014) climbs the Boltzmann likelihood of the demonstration; EM-MLIRL (Babes-Vroman et al. 2011)
+is a mixture of as many such experts as one says, fitted by expectation-maximisation. The likelihood is
+linear in the visits, so a cluster's M-step is MLIRL on the visits weighted by the responsibilities.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ...models.inputs.arguments import as_key
+from ...models.observation.demonstration import Demonstration
+from ...models.process.mdp import TabularMDP
+from ...models.process.planning import require_discounted
+from ...models.process.units import feature_scale, with_scaled_features
+from ..mixtures.clustering import Clustering
+from .boltzmann import (
+    BOX,
+    ETA,
+    boltzmann_log_policy,
+    count_log_likelihoods,
+    random_weights,
+    require_positive,
+    visit_counts,
+)
+
+
+class MLIRLFit(NamedTuple):
+    """Result of MLIRL.
+
+    Fields
+    ------
+    weights : float ``[K]``
+        Of the best start; scaled weights lie in ``[-1, 1]``.
+    log_likelihood : float
+        Of the whole demonstration, in nats, transition probabilities left out.
+    objective : float ``[restarts]``
+        Log-likelihood reached from each start.
+    iterations : int ``[restarts]``
+        Points evaluated on the way.
+    """
+
+    weights: Float[np.ndarray, " K"]
+    log_likelihood: float
+    objective: Float[np.ndarray, " restarts"]
+    iterations: Int[np.ndarray, " restarts"]
+
+
+class Ascent(NamedTuple):
+    """A point of the projected gradient ascent: value and gradient there, and the step to try next."""
+
+    weights: Float[Array, " K"]
+    value: Float[Array, ""]
+    gradient: Float[Array, " K"]
+    step: Float[Array, ""]
+    iterations: Int[Array, ""]
+
+
+def ascend(
+    mdp: TabularMDP,
+    counts: Float[Array, "S A"],
+    start: Float[Array, " K"],
+    eta: float | Array,
+    iterations: int,
+    tolerance: float = 1e-7,
+) -> Ascent:
+    """Climb ``sum N(s, a) log pi(a | s)`` by gradient ascent projected on the box; traceable.
+
+    The step grows while it succeeds and halves when it does not (Armijo's condition), so the value never
+    falls; ends when a step would move no weight by ``tolerance``.
+    """
+
+    @jax.value_and_grad
+    def objective(weights: Float[Array, " K"]) -> Float[Array, ""]:
+        return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, eta), counts[None])[0]
+
+    def reach(point: Ascent) -> Float[Array, ""]:
+        return point.step * jnp.max(jnp.abs(point.gradient))
+
+    def attempt(point: Ascent) -> Ascent:
+        weights = jnp.clip(point.weights + point.step * point.gradient, -BOX, BOX)
+        value, gradient = objective(weights)
+        gain = point.gradient @ (weights - point.weights)
+        better = value >= point.value + 1e-4 * gain
+        moved = Ascent(weights, value, gradient, 2 * point.step, point.iterations + 1)
+        stayed = point._replace(step=point.step / 2, iterations=point.iterations + 1)
+        return jax.tree.map(partial(jnp.where, better), moved, stayed)
+
+    def unfinished(point: Ascent) -> Array:
+        projected = jnp.clip(point.weights + point.step * point.gradient, -BOX, BOX) - point.weights
+        return (point.iterations < iterations) & (jnp.max(jnp.abs(projected)) > tolerance)
+
+    value, gradient = objective(start)
+    first = Ascent(start, value, gradient, jnp.ones(()), jnp.zeros((), int))
+    # A first step of a tenth of the box, whatever the amount of data.
+    first = first._replace(step=0.2 * BOX / jnp.maximum(reach(first), 1e-12))
+    return lax.while_loop(unfinished, attempt, first)
+
+
+@partial(jax.jit, static_argnames=("restarts", "iterations"))
+def _climb(key: Array, mdp: TabularMDP, counts: Array, eta: Array, restarts: int, iterations: int) -> Ascent:
+    def from_start(key: Array) -> Ascent:
+        return ascend(mdp, counts, random_weights(key, mdp.n_features), eta, iterations)
+
+    return lax.map(from_start, jax.random.split(key, restarts))
+
+
+def mlirl(
+    key: Array,
+    mdp: TabularMDP,
+    demonstration: Demonstration,
+    *,
+    eta: float = ETA,
+    restarts: int = 5,
+    iterations: int = 300,
+) -> MLIRLFit:
+    """Maximum-likelihood IRL: the weights under which the demonstration is likeliest.
+
+    Scaled weights (:mod:`~i2rl.models.process.units`) are looked for in ``[-1, 1]^K``.
+
+    Parameters
+    ----------
+    key : JAX random key
+        Of the starts, uniform on the box.
+    mdp, demonstration
+        The decision process; its demonstration, every step seen.
+    eta : float
+        Inverse temperature of the expert, per unit of value.
+    restarts, iterations : int
+        Starts, and evaluations from each at most. The likelihood has several local maxima, and ridges
+        (where the greedy policy changes) on which gradient ascent may rest; the best start is returned.
+
+    Raises
+    ------
+    DemonstrationError
+        Naming trajectory and step, for a step that was not seen or that is impossible.
+    ValueError
+        For an ``eta``, ``restarts`` or ``iterations`` that is not positive, or an undiscounted MDP.
+    """
+    require_discounted(mdp)
+    require_positive(eta=eta, restarts=restarts, iterations=iterations)
+    counts = visit_counts(mdp, demonstration).sum(0)
+    scaled = with_scaled_features(mdp)
+    ends = _climb(as_key(key), scaled, jnp.asarray(counts), jnp.asarray(float(eta)), restarts, iterations)
+    best = int(np.argmax(ends.value))
+    return MLIRLFit(
+        np.asarray(ends.weights[best] / feature_scale(mdp)),
+        float(ends.value[best]),
+        np.asarray(ends.value),
+        np.asarray(ends.iterations),
+    )
+
+
+def require_clusters(clusters: int, trajectories: int) -> None:
+    """Raise ``ValueError`` if there are fewer trajectories than clusters to put them in."""
+    if clusters > trajectories:
+        raise ValueError(
+            f"{clusters} clusters were asked for, but the demonstration has {trajectories} "
+            f"{'trajectory' if trajectories == 1 else 'trajectories'}: every cluster needs at least one"
+        )
+
+
+# -- mixture ------------------------------------------------------------------------------------------
+
+
+class Mixture(NamedTuple):
+    """Parameters of a mixture of Boltzmann experts: ``weights [D, K]``, ``proportions [D]``."""
+
+    weights: Float[Array, "D K"]
+    proportions: Float[Array, " D"]
+
+
+class EMTrace(NamedTuple):
+    """All that an EM fit computed.
+
+    Fields
+    ------
+    clustering : Clustering
+        Of the best start; its ``objective`` is the marginal log-likelihood.
+    log_likelihoods : float ``[restarts, iterations + 1]``
+        Marginal log-likelihood of the demonstration at the start and after each iteration, in nats.
+    """
+
+    clustering: Clustering
+    log_likelihoods: Float[np.ndarray, "restarts iterations"]
+
+
+class EMMLIRL(NamedTuple):
+    """EM-MLIRL on one decision process: ``fit(key, demonstration)`` uses all trajectories at once.
+
+    ``trace(key, demonstration)`` is the same fit with its history.
+    """
+
+    name: str
+    fit: Callable[[Array, Demonstration], Clustering]
+    trace: Callable[[Array, Demonstration], EMTrace]
+
+
+def component_log_likelihoods(
+    mdp: TabularMDP, weights: Float[Array, "D K"], counts: Float[Array, "n S A"], eta: float | Array
+) -> Float[Array, "n D"]:
+    """Log-likelihood of every trajectory under every cluster's weights; traceable."""
+
+    def one(theta: Float[Array, " K"]) -> Float[Array, " n"]:
+        return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, theta, eta), counts)
+
+    return lax.map(one, weights).T
+
+
+def _e_step(mdp: TabularMDP, mixture: Mixture, counts: Float[Array, "n S A"], eta: Array) -> tuple:
+    """Responsibilities ``[n, D]`` and the marginal log-likelihood."""
+    joint = jnp.log(mixture.proportions) + component_log_likelihoods(mdp, mixture.weights, counts, eta)
+    marginal = jax.nn.logsumexp(joint, axis=1)
+    return jnp.exp(joint - marginal[:, None]), jnp.sum(marginal)
+
+
+@partial(jax.jit, static_argnames=("clusters", "restarts", "iterations", "ascents"))
+def _em(
+    key: Array,
+    mdp: TabularMDP,
+    counts: Float[Array, "n S A"],
+    eta: Float[Array, ""],
+    clusters: int,
+    restarts: int,
+    iterations: int,
+    ascents: int,
+) -> tuple:
+    def improve(mixture: Mixture, _: None) -> tuple:
+        responsibilities, log_likelihood = _e_step(mdp, mixture, counts, eta)
+        visits = jnp.einsum("nd,nsa->dsa", responsibilities, counts)
+        weights = lax.map(lambda x: ascend(mdp, x[0], x[1], eta, ascents).weights, (visits, mixture.weights))
+        return Mixture(weights, jnp.mean(responsibilities, axis=0)), log_likelihood
+
+    def from_start(key: Array) -> tuple:
+        keys = jax.random.split(key, clusters)
+        start = jax.vmap(random_weights, in_axes=(0, None))(keys, mdp.n_features)
+        first = Mixture(start, jnp.full(clusters, 1 / clusters))
+        ends: tuple = lax.scan(improve, first, None, iterations)
+        mixture, history = ends
+        responsibilities, log_likelihood = _e_step(mdp, mixture, counts, eta)
+        return mixture, responsibilities, jnp.append(history, log_likelihood)
+
+    return lax.map(from_start, jax.random.split(key, restarts))
+
+
+def em_mlirl(
+    mdp: TabularMDP,
+    *,
+    clusters: int,
+    eta: float = ETA,
+    iterations: int = 50,
+    restarts: int = 1,
+    ascents: int = 30,
+) -> EMMLIRL:
+    """EM over a mixture of Boltzmann experts, their number given (Babes-Vroman et al. 2011).
+
+    Responsibilities ``v_{d,i} ~ rho_d prod_t pi_eta(a_t | s_t; theta_d)``; proportions are their means;
+    weights climb the responsibility-weighted log-likelihood from where they were, so the marginal
+    log-likelihood never falls. Starts: weights uniform on the box, equal proportions. The box ``[-1, 1]^K``
+    is of scaled weights (:mod:`~i2rl.models.process.units`).
+
+    Parameters
+    ----------
+    mdp : TabularMDP
+    clusters : int
+        Number of ways, ``D``.
+    eta : float
+        Inverse temperature of the experts, per unit of value.
+    iterations, restarts : int
+        EM iterations, and starts of which the likeliest is kept.
+    ascents : int
+        Gradient evaluations of each cluster in an M-step, at most.
+
+    Returns
+    -------
+    EMMLIRL
+        ``fit`` raises ``ValueError`` for more clusters than trajectories, and ``DemonstrationError`` naming
+        trajectory and step for one that was not seen or that is impossible.
+
+    Raises
+    ------
+    ValueError
+        For numbers that are not positive, or an undiscounted MDP.
+    """
+    require_discounted(mdp)
+    require_positive(clusters=clusters, eta=eta, iterations=iterations, restarts=restarts, ascents=ascents)
+    scale, scaled = feature_scale(mdp), with_scaled_features(mdp)
+
+    def trace(key: Array, demonstration: Demonstration) -> EMTrace:
+        counts = visit_counts(mdp, demonstration)
+        require_clusters(clusters, int((demonstration.lengths > 0).sum()))
+        # Rows of padding would count for the proportions.
+        real = demonstration.lengths > 0
+        mixtures, responsibilities, history = _em(
+            as_key(key), scaled, jnp.asarray(counts[real]), jnp.asarray(float(eta)),
+            clusters, restarts, iterations, ascents,
+        )  # fmt: skip
+        best = int(np.argmax(history[:, -1]))
+        proportions = np.asarray(responsibilities[best]).mean(0)
+        rows = np.broadcast_to(proportions, (len(real), clusters)).copy()
+        rows[real] = responsibilities[best]
+        clustering = Clustering(
+            np.asarray(mixtures.weights[best] / scale), proportions, rows, float(history[best, -1])
+        )
+        return EMTrace(clustering, np.asarray(history))
+
+    return EMMLIRL("EM-MLIRL", lambda key, demonstration: trace(key, demonstration).clustering, trace)

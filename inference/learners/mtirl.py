@@ -1,0 +1,464 @@
+"""Min-max-entropy multi-task IRL (chapter 5): several ways of doing a task, from one jumble of trajectories.
+
+Batch and online. How many ways there are, who did what, and the reward of each are learned together, by
+the alternation of :mod:`~i2rl.inference.mixtures.fit`; :mod:`~i2rl.inference.programs.minmax` poses the same
+program as one. The gradient for the assignments that the dissertation prints cannot cluster:
+:mod:`~i2rl.inference.programs.printed.minmax` shows it.
+"""
+
+from __future__ import annotations
+
+import time
+import warnings
+from collections.abc import Callable, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+from ...models.inputs.arguments import as_key
+from ...models.observation.demonstration import Demonstration, DemonstrationError
+from ...models.observation.evidence import (
+    Imperfection,
+    Sensor,
+    checked_demonstration,
+    fitting_sensor,
+    require_possible,
+)
+from ...models.process.mdp import TabularMDP
+from ...models.process.planning import reachable_states, require_discounted
+from ...models.process.units import feature_scale, with_scaled_features
+from ..completion.explanations import Jumble, explain_each, is_seen_whole, seen_in_part, seen_whole
+from ..mixtures.clustering import Clustering
+from ..mixtures.fit import (
+    Assigned,
+    Kept,
+    Mixture,
+    MixtureProgram,
+    assign,
+    empty_mixture,
+    log_policies,
+    nothing_kept,
+)
+from ..mixtures.search import Search, search
+from ..sessions.scaling import on_scaled_features
+from ..sessions.session import Learner, in_plain_numbers
+from .lme import _digest
+
+DEFAULT_WAYS = 4
+DEFAULT_RESTARTS = 4
+# Experts are decided: a prior of scale 7 on each weight admits one who errs once in a thousand choices.
+DEFAULT_RIDGE = 0.02
+_FEWEST_ROWS = 32
+
+
+class MixtureState(NamedTuple):
+    """What online MME-MTIRL carries from session to session (section 5.2). Empty slots have no mass.
+
+    Fields
+    ------
+    weights : float ``[D, K]``
+        Reward weights of each way, ``theta_d``.
+    values : float ``[D, S]``
+        Their soft values: planning's warm start.
+    proportions : float ``[D]``
+        Mixture weights ``pi_d``.
+    mass : float ``[D]``
+        ``sum_i v_{d,i}`` over all trajectories so far; it sums to their number.
+    visits : float ``[D, S, A]``
+        ``sum_i v_{d,i} N_i(s, a)``, visits of seen steps. ``|X| phi_hat_d`` of Eq. 5.8 is its product with
+        the features; adding to the two sums is Eq. 5.7 and 5.8.
+    session : int
+        Sessions so far.
+    key : random key
+    """
+
+    weights: Float[Array, "D K"]
+    values: Float[Array, "D S"]
+    proportions: Float[Array, " D"]
+    mass: Float[Array, " D"]
+    visits: Float[Array, "D S A"]
+    session: Int[Array, ""]
+    key: Array
+
+
+class MixtureReport(NamedTuple):
+    """What a session did; fields as in :class:`~i2rl.inference.Report`, where not said otherwise.
+
+    Fields
+    ------
+    session : int
+    log_likelihood : float
+        Of all that is kept, in nats per trajectory, dynamics left out: each trajectory under its own way,
+        and of the way under the proportions.
+    demonstration_log_likelihood : float
+        Exact log-likelihood of this session's trajectories under the mixture, dynamics included.
+    gradient : float
+        Norm over all ways of the log-likelihood's gradient in scaled weights at those the session began with.
+    iterations, solver_iterations : int
+        Of the alternation and of the programs' solver, in the start that was kept.
+    converged : bool
+        Whether the programs of its last alternation met their tolerances.
+    seconds : float
+    weights : float ``[D, K]``
+    proportions : float ``[D]``
+        Zero for empty slots.
+    ways : int
+        How many there are now.
+    starts : int
+        How many starts were tried; one when nothing suggested a new way.
+    assignments : int ``[n]``
+        The likeliest way of each of this session's trajectories.
+    responsibilities : float ``[n, D]``
+    """
+
+    session: int
+    log_likelihood: float
+    demonstration_log_likelihood: float
+    gradient: float
+    iterations: int
+    solver_iterations: int
+    converged: bool
+    seconds: float
+    weights: Float[np.ndarray, "D K"]
+    proportions: Float[np.ndarray, " D"]
+    ways: int
+    starts: int
+    assignments: Int[np.ndarray, " n"]
+    responsibilities: Float[np.ndarray, "n D"]
+
+
+def mme_mtirl(
+    mdp: TabularMDP,
+    sensor: Imperfection | None = None,
+    *,
+    ways: int = DEFAULT_WAYS,
+    strength: float = 1.0,
+    price: float = 0.5,
+    l1: float = 0.0,
+    ridge: float = DEFAULT_RIDGE,
+    restarts: int = DEFAULT_RESTARTS,
+    iterations: int = 50,
+    tolerance: float = 1e-6,
+) -> Learner:
+    """Online MME-MTIRL: a session learns from its own trajectories and the statistic of earlier ones (5.2).
+
+    A session first explains its trajectories by the ways known so far. Where that is so bad that a new way
+    could pay for itself, the empty slots are tried too, so that a way that first appears late is found.
+
+    Parameters
+    ----------
+    mdp : TabularMDP
+        The task without its reward; discount below 1.
+    sensor : Imperfection, optional
+        What is hidden or misread; without it everything is seen.
+    ways : int
+        Most ways there can be at a time, ``D``.
+    strength : float
+        ``lambda`` of the entropic prior on the proportions, ``exp(-lambda H(pi))``: the min-entropy half of
+        program (5.1). The dissertation's is 1.
+    price : float
+        What a nat of information of who did what costs, in nats of likelihood; see
+        :mod:`~i2rl.inference.mixtures.fit`. 1 is the likelihood's own price, right for people who err; less
+        prefers several decided ways to one undecided.
+    l1, ridge : float
+        Rate of a Laplace and precision of a Gaussian prior on each scaled weight (nats in all, not per
+        trajectory), the reward in nats that a feature adds at most (:mod:`~i2rl.models.process.units`).
+    restarts : int
+        Seedings of the empty slots that are tried.
+    iterations, tolerance : int, float
+        A climb ends after so many alternations, or when one gains less than ``tolerance`` nats.
+
+    Returns
+    -------
+    Learner
+        ``update(state, demonstration)`` gives a :class:`MixtureState` and a :class:`MixtureReport`. Raises
+        :class:`DemonstrationError` naming trajectory and step for what the model rules out, an action that
+        is not available in its state among it; the state it was given stays valid.
+
+    Raises
+    ------
+    ValueError
+        For discount 1, fewer than one way, or settings that are negative or not finite.
+    """
+    sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
+
+    def build(mdp: TabularMDP) -> Learner:
+        program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
+        configuration = {
+            "ways": ways, "strength": strength, "price": price, "l1": l1, "ridge": ridge,
+            "restarts": restarts, "iterations": iterations, "tolerance": tolerance, "sensor": _digest(sensor),
+        }  # fmt: skip
+        return _learner(program, sensor, ways, restarts, configuration)
+
+    return on_scaled_features(mdp, build)
+
+
+def _learner(
+    program: MixtureProgram,
+    sensor: Imperfection,
+    ways: int,
+    restarts: int,
+    configuration: Mapping[str, Any],
+) -> Learner:
+    mdp = program.mdp
+
+    def session(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
+        jumble = seen_in_part(mdp, sensor, demonstration)
+        return _conclude(program, state, *_begin(program, state, jumble, restarts, search))
+
+    def init(key: Array) -> MixtureState:
+        empty, kept = empty_mixture(mdp, ways), nothing_kept(mdp, ways)
+        return MixtureState(*empty, *kept, jnp.zeros((), int), as_key(key))
+
+    def update(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
+        began = time.perf_counter()
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="multi-task learning")
+        rows = np.flatnonzero(demonstration.lengths)
+        jumble = _gather(mdp, sensor, demonstration)
+        new, report = _concluded(program, state, *_begin(program, state, jumble, restarts, _searched))
+        if not np.isfinite(report.demonstration_log_likelihood):
+            _explain_impossible(sensor, mdp, demonstration)
+        report = report._replace(
+            assignments=np.asarray(report.assignments)[rows],
+            responsibilities=np.asarray(report.responsibilities)[rows],
+        )
+        return new, in_plain_numbers(report, time.perf_counter() - began)
+
+    @jax.jit
+    def likelihood(state: MixtureState, weights: Float[Array, "D K"]) -> Float[Array, ""]:
+        return _kept_log_likelihood(mdp, state, weights)
+
+    def log_likelihood(state: MixtureState, weights: Float[Array, "D K"]) -> float:
+        return float(likelihood(state, jnp.asarray(weights, float)))
+
+    return Learner(
+        "online MME-MTIRL",
+        mdp,
+        configuration,
+        init,
+        update,  # type: ignore[arg-type]
+        session,  # type: ignore[arg-type]
+        log_likelihood,
+    )
+
+
+class BatchMixture(NamedTuple):
+    """Batch multi-task IRL; ``fit(key, demonstration)`` uses all trajectories at once."""
+
+    name: str
+    fit: Callable[[Array, Demonstration], Clustering]
+
+
+def batch_mme_mtirl(
+    mdp: TabularMDP,
+    sensor: Imperfection | None = None,
+    *,
+    ways: int = DEFAULT_WAYS,
+    strength: float = 1.0,
+    price: float = 0.5,
+    l1: float = 0.0,
+    ridge: float = DEFAULT_RIDGE,
+    restarts: int = DEFAULT_RESTARTS,
+    iterations: int = 50,
+    tolerance: float = 1e-6,
+) -> BatchMixture:
+    """Batch MME-MTIRL (section 5.1): the alternation from several seedings of ``ways`` ways, best one kept.
+
+    Parameters as for :func:`mme_mtirl`. The :class:`Clustering` has the ways that were found, the largest
+    first, and the min-max-entropy program's objective ``J``. With fewer trajectories than ``ways``, there
+    is a warning, and at most one way a trajectory. ``fit`` raises :class:`DemonstrationError` as
+    :func:`mme_mtirl` does.
+    """
+    sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
+    scale = np.asarray(feature_scale(mdp))
+    mdp = with_scaled_features(mdp)
+    program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
+    nothing, empty = nothing_kept(mdp, ways), empty_mixture(mdp, ways)
+
+    def fit(key: Array, demonstration: Demonstration) -> Clustering:
+        demonstration = checked_demonstration(mdp, demonstration, needed_by="multi-task learning")
+        rows = np.flatnonzero(demonstration.lengths)
+        if len(rows) < ways:
+            warnings.warn(
+                f"{ways} ways were to be started from, but there are {len(rows)} trajectories: no more ways "
+                "than that can be found",
+                stacklevel=2,
+            )
+        jumble = _gather(mdp, sensor, demonstration)
+        found = _searched(program, jumble, nothing, empty, as_key(key), restarts).fit
+        if not np.isfinite(found.objective):
+            _explain_impossible(sensor, mdp, demonstration)
+        proportions = np.asarray(found.mixture.proportions)
+        order = np.argsort(-proportions, kind="stable")[: np.count_nonzero(proportions)]
+        return Clustering(
+            np.asarray(found.mixture.weights)[order] / scale,
+            proportions[order],
+            np.asarray(found.responsibilities)[rows][:, order],
+            float(found.objective),
+        )
+
+    return BatchMixture("MME-MTIRL", fit)
+
+
+def clustering_of(state: MixtureState, report: MixtureReport) -> Clustering:
+    """What an online learner has found, with the assignments of its last session; largest way first."""
+    proportions = np.asarray(state.proportions)
+    order = np.argsort(-proportions, kind="stable")[: np.count_nonzero(proportions)]
+    return Clustering(
+        np.asarray(state.weights)[order],
+        proportions[order],
+        np.asarray(report.responsibilities)[:, order],
+        float(report.log_likelihood) * float(np.sum(state.mass)),
+    )
+
+
+def assign_trajectories(
+    mdp: TabularMDP,
+    sensor: Imperfection | None,
+    weights: Float[np.ndarray, "D K"],
+    proportions: Float[np.ndarray, " D"],
+    demonstration: Demonstration,
+) -> Float[np.ndarray, "n D"]:
+    """Probability that each trajectory was done in each of these ways, hidden steps summed out.
+
+    By Bayes' rule alone (price 1), for any trajectories. Raises as :func:`mme_mtirl`'s ``update`` does, and
+    ``ValueError`` for weights that are not finite, proportions that are negative or all zero, or shapes that
+    do not fit.
+    """
+    weights, proportions = np.asarray(weights, float), np.asarray(proportions, float)
+    if weights.shape != (*proportions.shape, mdp.n_features) or weights.ndim != 2:
+        raise ValueError(
+            f"weights and proportions must have shapes [D, {mdp.n_features}] and [D], got "
+            f"{list(weights.shape)} and {list(proportions.shape)}"
+        )
+    if not np.isfinite(weights).all():
+        raise ValueError(f"weights must be finite, got {weights[~np.isfinite(weights)][0]}")
+    if not (np.isfinite(proportions) & (proportions >= 0)).all() or not proportions.any():
+        raise ValueError(f"proportions must be finite, not negative and not all zero, got {proportions}")
+    sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
+    demonstration = checked_demonstration(mdp, demonstration, needed_by="multi-task learning")
+    rows = np.flatnonzero(demonstration.lengths)
+    jumble = _gather(mdp, sensor, demonstration)
+    assigned = _assigned(mdp, jnp.asarray(weights), jnp.asarray(proportions), jumble)
+    if not np.isfinite(assigned.log_likelihood).all():
+        _explain_impossible(sensor, mdp, demonstration)
+    return np.asarray(assigned.responsibilities)[rows]
+
+
+@jax.jit
+def _assigned(
+    mdp: TabularMDP, weights: Float[Array, "D K"], proportions: Float[Array, " D"], jumble: Jumble
+) -> Assigned:
+    policies, _ = log_policies(mdp, weights, jnp.zeros((len(weights), mdp.n_states)))
+    return assign(explain_each(mdp, policies, jumble).log_likelihood, proportions, jumble.live, 1.0)
+
+
+# -- building blocks ----------------------------------------------------------------------------------
+
+
+def _program(
+    mdp: TabularMDP,
+    ways: int,
+    strength: float,
+    price: float,
+    l1: float,
+    ridge: float,
+    restarts: int,
+    iterations: int,
+    tolerance: float,
+) -> MixtureProgram:
+    require_discounted(mdp)
+    for name, number in (("ways", ways), ("restarts", restarts), ("iterations", iterations)):
+        if not number >= 1:
+            raise ValueError(f"{name} must be at least 1, got {number}")
+        if number != int(number):
+            raise ValueError(f"{name} must be a whole number, got {number}")
+    for name, value in (("strength", strength), ("price", price), ("l1", l1), ("ridge", ridge)):
+        if not 0 <= value < float("inf"):
+            raise ValueError(f"{name} must be finite and not negative, got {value}")
+    if np.isnan(tolerance):
+        raise ValueError("tolerance must be a number of nats, got nan")
+    if price == 0:
+        raise ValueError("price must be more than zero: every trajectory would be a way of its own")
+    reachable = jnp.asarray(reachable_states(mdp))
+    return MixtureProgram(mdp, reachable, strength, l1, ridge, price, iterations, tolerance)
+
+
+_seen_whole, _seen_in_part = jax.jit(seen_whole), jax.jit(seen_in_part)
+
+
+def _gather(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> Jumble:
+    padded, seen_by = demonstration.bucketed(), Sensor(sensor.presence, sensor.reading)
+    if not is_seen_whole(sensor, demonstration):
+        return _seen_in_part(mdp, seen_by, padded)
+    # Visits of a few trajectories more cost less than compiling for one shape more.
+    rows = max(padded.n_trajectories, _FEWEST_ROWS)
+    return _seen_whole(mdp, seen_by, padded.padded(rows, padded.kind.shape[1]))
+
+
+def _explain_impossible(sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration) -> None:
+    require_possible(sensor, mdp, demonstration)
+    raise DemonstrationError("a trajectory has probability zero under every way of doing the task")
+
+
+# Compiled once for all learners of one shape of problem, batch and online.
+_searched = jax.jit(search)
+
+
+def _begin(
+    program: MixtureProgram, state: MixtureState, jumble: Jumble, restarts: int, find: Callable[..., Search]
+) -> tuple[Search, Array]:
+    key, seed = jax.random.split(state.key)
+    kept = Kept(state.mass, state.visits)
+    mixture = Mixture(state.weights, state.values, state.proportions)
+    return find(program, jumble, kept, mixture, seed, restarts), key
+
+
+def _kept_log_likelihood(
+    mdp: TabularMDP, state: MixtureState, weights: Float[Array, "D K"]
+) -> Float[Array, ""]:
+    """Of all that is kept, under these weights and the state's proportions, in nats per trajectory."""
+    policies, _ = log_policies(mdp, weights, state.values)
+    done = jnp.sum(state.visits * jnp.where(mdp.available, policies, 0.0))
+    chosen = state.mass @ jnp.log(jnp.where(state.proportions > 0, state.proportions, 1.0))
+    return (done + chosen) / jnp.maximum(jnp.sum(state.mass), 1.0)
+
+
+def _conclude(
+    program: MixtureProgram, state: MixtureState, found: Search, key: Array
+) -> tuple[MixtureState, MixtureReport]:
+    mdp, fit = program.mdp, found.fit
+    mass = fit.kept.mass + jnp.sum(fit.responsibilities, axis=0)
+    learned = MixtureState(*fit.mixture, mass, fit.kept.visits + fit.seen, state.session + 1, key)
+
+    def known(weights: Float[Array, "D K"]) -> Float[Array, ""]:
+        return _kept_log_likelihood(mdp, learned, weights)
+
+    present = fit.mixture.proportions > 0
+    own = jnp.sum(fit.log_likelihood)
+    fields: dict[str, Any] = {
+        "session": state.session + 1,
+        "log_likelihood": known(fit.mixture.weights),
+        "demonstration_log_likelihood": own,
+        "gradient": jnp.linalg.norm(jax.grad(known)(state.weights)),
+        "iterations": fit.iterations,
+        "solver_iterations": fit.solver_iterations,
+        "converged": fit.converged,
+        "seconds": jnp.array(jnp.nan),
+        "weights": fit.mixture.weights,
+        "proportions": fit.mixture.proportions,
+        "ways": jnp.sum(present),
+        "starts": found.tried,
+        "assignments": jnp.argmax(fit.responsibilities, axis=1),
+        "responsibilities": fit.responsibilities,
+    }
+    # An observation that cannot be must not spoil what was learned (a fleet raises nothing).
+    possible = jnp.isfinite(own)
+    return jax.tree.map(partial(jnp.where, possible), learned, state), MixtureReport(**fields)
+
+
+_concluded = jax.jit(_conclude)

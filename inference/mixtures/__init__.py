@@ -1,0 +1,4 @@
+"""Mixtures of components: assignments, proportions, and the number of components.
+
+Imports the rooms of programs and completion.
+"""

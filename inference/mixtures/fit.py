@@ -1,0 +1,271 @@
+"""The min-max-entropy mixture fitted by alternation: assignments, proportions and rewards in turn.
+
+The sound form of program (5.1). Given trajectories and, online, what is kept of earlier ones, it climbs ::
+
+    J = sum_{i,d} v_{d,i} log P(X_i; theta_d) + sum_d N_d . log pi_theta_d
+        - price { sum_{i,d} v_{d,i} log v_{d,i} - sum_d (n_d + sum_i v_{d,i}) log pi_d
+                  - strength sum_d pi_d log pi_d }
+        - sum_d (l1 |theta_d|_1 + ridge/2 |theta_d|^2)
+
+(``n_d``, ``N_d``: mass and visits kept of earlier sessions). The E-step makes ``v_{d,i}`` proportional to
+``pi_d P(X_i; theta_d)^(1/price)``; the M-steps are
+:func:`~i2rl.inference.programs.entropic.entropic_proportions` and one maximum-entropy program per way
+(:func:`~i2rl.inference.programs.maximum_entropy.fit_counts`). ``J`` never falls while the ways stay the same.
+Features are scaled (:mod:`~i2rl.models.process.units`), so penalties are of scaled weights.
+
+*How many ways.* With ``price`` 1, ``J`` is the likelihood of a mixture, and that cannot tell a sorter who
+flips a coin once and then sticks to it from two sorters who know what they want: the first costs ``log 2``
+nats of indecision, the second ``log 2`` nats to say which sorter it was. Mixtures of rewards are about people
+who know what they want, so the information of who did what is charged at less than its price (a point further
+along the same rate-distortion curve). :mod:`~i2rl.inference.mixtures.search` decides how many ways there are.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import lax
+from jax.scipy.special import xlogy
+from jaxtyping import Array, Bool, Float, Int
+
+from ...models.process.mdp import TabularMDP
+from ...models.process.planning import reward_of, soft_plan
+from ..completion.explanations import Jumble, explain_each
+from ..programs.entropic import entropic_proportions
+from ..programs.maximum_entropy import WarmStart, fit_scaled_counts
+
+
+class MixtureProgram(NamedTuple):
+    """What is being solved: see the module's formula; features of ``mdp`` are scaled.
+
+    The climb ends when ``J`` gains less than ``tolerance`` nats, or after ``iterations``.
+    """
+
+    mdp: TabularMDP
+    reachable: Bool[Array, " S"]
+    strength: Array | float
+    l1: Array | float
+    ridge: Array | float
+    price: Array | float
+    iterations: Array | int
+    tolerance: Array | float
+
+
+class Kept(NamedTuple):
+    """What is kept of earlier trajectories: how many were done each way, and the visits they made."""
+
+    mass: Float[Array, " D"]
+    visits: Float[Array, "D S A"]
+
+
+class Mixture(NamedTuple):
+    """Ways of doing the task; a way without proportion is an empty slot."""
+
+    weights: Float[Array, "D K"]
+    values: Float[Array, "D S"]
+    proportions: Float[Array, " D"]
+
+
+class Fit(NamedTuple):
+    """A mixture, what it makes of the jumble, and what finding it took.
+
+    Fields
+    ------
+    mixture : Mixture
+    kept : Kept
+        What was kept, merged as the ways were.
+    responsibilities : float ``[n, D]``
+        ``v_{d,i}``; zero for rows of padding.
+    visits, seen : float ``[D, S, A]``
+        The jumble's expected visits by way: of all steps, and of the steps seen.
+    log_likelihood : float ``[n]``
+        ``log sum_d pi_d P(X_i; theta_d)``.
+    objective, score : float
+        ``J``, and what solutions of different sizes are ranked by (minus infinity until it is asked for).
+    gain : float
+        Of ``J`` in the last iteration.
+    iterations, solver_iterations : int
+    converged : bool
+        Whether the programs of the last M-step met their tolerances.
+    """
+
+    mixture: Mixture
+    kept: Kept
+    responsibilities: Float[Array, "n D"]
+    visits: Float[Array, "D S A"]
+    seen: Float[Array, "D S A"]
+    log_likelihood: Float[Array, " n"]
+    objective: Float[Array, ""]
+    score: Float[Array, ""]
+    gain: Float[Array, ""]
+    iterations: Int[Array, ""]
+    solver_iterations: Int[Array, ""]
+    converged: Bool[Array, ""]
+
+
+def nothing_kept(mdp: TabularMDP, ways: int) -> Kept:
+    """The statistic before the first trajectory."""
+    return Kept(jnp.zeros(ways), jnp.zeros((ways, mdp.n_states, mdp.n_actions)))
+
+
+def empty_mixture(mdp: TabularMDP, ways: int) -> Mixture:
+    """So many empty slots."""
+    return Mixture(jnp.zeros((ways, mdp.n_features)), jnp.zeros((ways, mdp.n_states)), jnp.zeros(ways))
+
+
+# -- the two steps ------------------------------------------------------------------------------------
+
+
+def log_policies(
+    mdp: TabularMDP, weights: Float[Array, "D K"], values: Float[Array, "D S"]
+) -> tuple[Float[Array, "D S A"], Float[Array, "D S"]]:
+    """Soft log-policies of every way (``-inf`` where an action is unavailable), and their values."""
+
+    def one(inputs: tuple) -> tuple:
+        plan = soft_plan(mdp, reward_of(mdp, inputs[0]), inputs[1])
+        return plan.log_policy, plan.values
+
+    return lax.map(one, (weights, values))
+
+
+def _finite_log(p: Array) -> Array:
+    """``log p``, and 0 where ``p`` is 0: for sums in which such terms carry no mass."""
+    return jnp.where(p > 0, jnp.log(jnp.where(p > 0, p, 1.0)), 0.0)
+
+
+class Assigned(NamedTuple):
+    """Who did what: responsibilities, what each trajectory adds to ``J``, its log-likelihood."""
+
+    responsibilities: Float[Array, "n D"]
+    value: Float[Array, " n"]
+    log_likelihood: Float[Array, " n"]
+
+
+def assign(
+    log_likelihood: Float[Array, "D n"],
+    proportions: Float[Array, " D"],
+    live: Bool[Array, " n"],
+    price: Array | float,
+) -> Assigned:
+    """The E-step, given the log-likelihood of every trajectory under every way."""
+    present = jnp.where(proportions > 0, _finite_log(proportions), -jnp.inf)
+    joint = log_likelihood.T / price + present
+    total = jax.nn.logsumexp(joint, axis=1)
+    possible = jnp.isfinite(total)
+    shares = jnp.exp(joint - jnp.where(possible, total, 0.0)[:, None])
+    return Assigned(
+        jnp.where((live & possible)[:, None], shares, 0.0),
+        jnp.where(live, price * total, 0.0),
+        jnp.where(live, jax.nn.logsumexp(log_likelihood.T + present, axis=1), 0.0),
+    )
+
+
+def proportions_of(program: MixtureProgram, mass: Float[Array, " D"]) -> Float[Array, " D"]:
+    """The best proportions after so many trajectories of each way; of none, all slots stay empty."""
+    return jnp.where(jnp.sum(mass) > 0, entropic_proportions(mass, program.strength), 0.0)
+
+
+def penalty(program: MixtureProgram, weights: Float[Array, "*D K"]) -> Float[Array, ""]:
+    """What the priors on the weights take off ``J``, in nats."""
+    return program.l1 * jnp.sum(jnp.abs(weights)) + program.ridge / 2 * jnp.sum(weights**2)
+
+
+def objective_of(
+    program: MixtureProgram, kept: Kept, mixture: Mixture, policies: Float[Array, "D S A"], assigned: Assigned
+) -> Float[Array, ""]:
+    """``J``."""
+    weights, proportions = mixture.weights, mixture.proportions
+    known = jnp.sum(kept.visits * jnp.where(program.mdp.available, policies, 0.0))
+    entropic = program.strength * jnp.sum(xlogy(proportions, proportions))
+    return (
+        jnp.sum(assigned.value)
+        + known
+        + program.price * (kept.mass @ _finite_log(proportions) + entropic)
+        - penalty(program, weights)
+    )
+
+
+def _collected(responsibilities: Float[Array, "n D"], visits: Float[Array, "D n S A"]) -> Array:
+    return jnp.einsum("nd,dnsa->dsa", responsibilities, visits)
+
+
+def e_step(
+    program: MixtureProgram,
+    jumble: Jumble,
+    kept: Kept,
+    mixture: Mixture,
+    before: Float[Array, ""],
+    iterations: Array,
+    solver_iterations: Array,
+) -> Fit:
+    """Who did what under these ways, and ``J``; ``before`` is the ``J`` to compare with."""
+    policies, values = log_policies(program.mdp, mixture.weights, mixture.values)
+    mixture = mixture._replace(values=values)
+    explained = explain_each(program.mdp, policies, jumble, mixture.proportions > 0)
+    assigned = assign(explained.log_likelihood, mixture.proportions, jumble.live, program.price)
+    objective = objective_of(program, kept, mixture, policies, assigned)
+    shares = assigned.responsibilities
+    return Fit(
+        mixture, kept, shares, _collected(shares, explained.visits), _collected(shares, explained.seen),
+        assigned.log_likelihood, objective, jnp.array(-jnp.inf), objective - before, iterations,
+        solver_iterations, jnp.array(True),
+    )  # fmt: skip
+
+
+def _m_step(
+    program: MixtureProgram, kept: Kept, mixture: Mixture, mass: Float[Array, " D"], visits: Array
+) -> tuple[Mixture, Int[Array, ""], Bool[Array, ""]]:
+    """Proportions and rewards for the trajectories assigned to each way, kept ones included.
+
+    With them the iterations of the solver, and whether every program met its tolerance.
+    """
+
+    def reward(inputs: tuple) -> tuple:
+        counts, *start = inputs
+        solution = fit_scaled_counts(program.mdp, counts, program.l1, program.ridge, WarmStart(*start))
+        return solution.weights, solution.values, solution.iterations, solution.converged
+
+    fitted = lax.map(reward, (kept.visits + visits, mixture.weights, mixture.values))
+    proportions = proportions_of(program, kept.mass + mass)
+    return Mixture(fitted[0], fitted[1], proportions), jnp.sum(fitted[2]), jnp.all(fitted[3])
+
+
+def climb(
+    program: MixtureProgram,
+    jumble: Jumble,
+    kept: Kept,
+    mixture: Mixture,
+    responsibilities: Float[Array, "n D"],
+    visits: Float[Array, "D S A"],
+) -> Fit:
+    """Alternate until ``J`` stands still, beginning with the M-step for these assignments."""
+
+    def step(fit: Fit) -> Fit:
+        mass = jnp.sum(fit.responsibilities, axis=0)
+        new, spent, converged = _m_step(program, kept, fit.mixture, mass, fit.visits)
+        counted = (fit.iterations + 1, fit.solver_iterations + spent)
+        return e_step(program, jumble, kept, new, fit.objective, *counted)._replace(converged=converged)
+
+    def unfinished(fit: Fit) -> Bool[Array, ""]:
+        return (fit.gain > program.tolerance) & (fit.iterations < program.iterations)
+
+    return lax.while_loop(unfinished, step, unmade(program, jumble, kept, mixture, responsibilities, visits))
+
+
+def unmade(
+    program: MixtureProgram,
+    jumble: Jumble,
+    kept: Kept,
+    mixture: Mixture,
+    responsibilities: Array,
+    visits: Array,
+) -> Fit:
+    """A fit that is still to be made: assignments alone."""
+    nowhere, zero = jnp.array(-jnp.inf), jnp.zeros((), int)
+    unknown = jnp.zeros(jumble.live.shape)
+    return Fit(
+        mixture, kept, responsibilities, visits, visits, unknown, nowhere, nowhere, -nowhere, zero, zero,
+        jnp.array(True),
+    )  # fmt: skip

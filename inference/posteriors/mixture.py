@@ -1,0 +1,207 @@
+"""The posterior over several ways of doing a task, as ArviZ ``InferenceData``.
+
+NUTS moves in weights and proportions, with assignments and hidden steps summed out exactly; then each draw
+gets one joint assignment of the trajectories. :mod:`~i2rl.inference.posteriors.gibbs` draws from the same
+posterior.
+"""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import NamedTuple
+
+import arviz as az
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro.distributions as dist
+from jaxtyping import Array, Float
+from numpyro.distributions import constraints
+from numpyro.infer import NUTS
+
+from ...models.inputs.arguments import as_key
+from ...models.laws.mixture import COMPONENTS, stick_proportions
+from ...models.observation.demonstration import Demonstration
+from ...models.observation.evidence import Imperfection
+from ...models.process.mdp import TabularMDP
+from .chains import Transitions, in_threads, run_nuts
+from .mixture_problem import (
+    MixtureProblem,
+    Position,
+    Start,
+    mixture_data,
+    pose,
+    potential,
+    resolve_jit,
+    starts,
+)
+
+
+class MixtureChain(NamedTuple):
+    """One chain of NUTS.
+
+    ``weights [draws, T, K]``, ``proportions [draws, T]``, ``concentration [draws]``, and what the sampler
+    did.
+    """
+
+    weights: Float[Array, "draws T K"]
+    proportions: Float[Array, "draws T"]
+    concentration: Float[Array, " draws"]
+    transitions: Transitions
+
+
+def nuts_mixture_chain(
+    key: Array,
+    problem: MixtureProblem,
+    start: Position,
+    *,
+    warmup: int,
+    draws: int,
+    target_accept: float = 0.9,
+    max_tree_depth: int = 8,
+) -> MixtureChain:
+    """Run one chain of NUTS from unconstrained sites ``start``; traceable."""
+    kernel = NUTS(
+        potential_fn=lambda z: potential(z, problem),
+        step_size=0.1,
+        target_accept_prob=target_accept,
+        max_tree_depth=max_tree_depth,
+    )
+    drawn, transitions = run_nuts(key, kernel, start, lambda z: constrained(z, problem), warmup, draws)
+    return MixtureChain(*drawn, transitions)
+
+
+def constrained(position: Position, problem: MixtureProblem) -> tuple[Array, Array, Array]:
+    """Weights, proportions and concentration at unconstrained sites."""
+    weights = dist.biject_to(problem.prior.support)(position["weights"])
+    proportions = jnp.ones(1)
+    if "sticks" in position:
+        proportions = stick_proportions(dist.biject_to(constraints.unit_interval)(position["sticks"]))
+    concentration = problem.concentration
+    if isinstance(concentration, dist.Distribution):
+        concentration = dist.biject_to(concentration.support)(position["concentration"])
+    return weights, proportions, concentration
+
+
+_run_chain = jax.jit(
+    nuts_mixture_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth")
+)
+
+
+def _start_position(key: Array, start: Start, problem: MixtureProblem, components: int) -> Position:
+    """Unconstrained sites at a start; components without trajectories are drawn from the prior."""
+    alpha = problem.concentration
+    position: Position = {}
+    if isinstance(alpha, dist.Distribution):
+        position["concentration"] = dist.biject_to(alpha.support).inv(jnp.ones(()))
+        alpha = jnp.ones(())
+    counts = np.bincount(start.assignment, minlength=components)
+    after = counts[::-1].cumsum()[::-1] - counts
+    sticks = (1.0 + counts) / (1.0 + counts + float(alpha) + after)
+    if components > 1:
+        position["sticks"] = dist.biject_to(constraints.unit_interval).inv(jnp.asarray(sticks[:-1]))
+    spare = components - len(start.position)
+    drawn = dist.biject_to(problem.prior.support).inv(problem.prior.sample(key, (spare,)))
+    position["weights"] = jnp.concatenate([jnp.asarray(start.position), drawn])
+    return position
+
+
+def sample_mixture_posterior(
+    key: Array,
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    demonstration: Demonstration,
+    *,
+    components: int = COMPONENTS,
+    concentration: float | dist.Distribution = 1.0,
+    prior: dist.Distribution | None = None,
+    draws: int = 500,
+    warmup: int = 500,
+    chains: int = 4,
+    target_accept: float = 0.9,
+    max_tree_depth: int = 8,
+) -> az.InferenceData:
+    """Draw from the posterior of :func:`mixture_model` by NUTS, then assignments given each draw.
+
+    NUTS follows gradients and does not hop between modes: a mode is a partition of the trajectories into
+    ways, times every naming of the components. Each chain starts from another partition (k-means of feature
+    counts into two to six ways, each way at its own posterior mode), and what it explores from there is what
+    it reports. So R-hat of ``weights`` and ``proportions`` is large whenever chains name the components
+    differently, which is no fault, and small only if they happen not to. Diagnose the quantities of
+    :func:`label_invariant` instead: if *their* R-hat is large, chains are in different partitions, their
+    draws must not be pooled, and :func:`gibbs_mixture_posterior`, which moves trajectories one by one, is
+    the better sampler.
+
+    Parameters
+    ----------
+    key : JAX random key
+    mdp, sensor, demonstration
+        The decision process, how it was perceived, and what was perceived. Scores play no part.
+    components : int
+        ``T``, the truncation; the attribute ``truncation_error`` says what it may cost.
+    concentration : float or Distribution
+        ``alpha``, or its prior.
+    prior : Distribution, optional
+        Of each way's scaled weights (:mod:`~i2rl.models.process.units`), see
+        :func:`~i2rl.models.weights_prior`.
+    draws, warmup, chains : int
+        Draws kept and discarded by each chain, and number of chains.
+    target_accept, max_tree_depth
+        As in NumPyro's ``NUTS``.
+
+    Returns
+    -------
+    arviz.InferenceData
+        ``posterior``: ``weights (chain, draw, component, feature)``, ``proportions (chain, draw,
+        component)``, and ``concentration (chain, draw)`` if it is random.
+        ``assignments``: ``assignment (chain, draw, trajectory)``, the component of each trajectory in that
+        draw; ``n_ways (chain, draw)``, the number of components that have any, and its posterior
+        ``n_ways_probability (ways)``, 1 to the number of trajectories; ``log_joint (chain, draw)``, see
+        :class:`Resolved`; ``co_clustering (trajectory, trajectory_)``, the posterior probability that two
+        trajectories were done the same way.
+        ``log_likelihood``: ``demonstration (chain, draw, trajectory)``, assignments summed out.
+        ``sample_stats``: as in :func:`sample_posterior`.
+        ``observed_data``: ``kind``, ``state``, ``action (trajectory, step)``.
+
+    Raises
+    ------
+    DemonstrationError
+        Naming trajectory and step, if the MDP and the sensor rule an observation out.
+    ValueError
+        For an empty demonstration, a prior of another shape, a concentration that is not positive, numbers of
+        components, draws or chains below one, or an undiscounted MDP.
+    """
+    key = as_key(key)
+    problem, demonstration, present = pose(
+        mdp,
+        sensor,
+        demonstration,
+        concentration=concentration,
+        prior=prior,
+        at_least_one={"components": components, "draws": draws, "chains": chains},
+        warmup=warmup,
+    )
+    start_key, fill_key, chain_key, assign_key = jax.random.split(key, 4)
+    run = partial(
+        _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
+    )
+    begins = [
+        _start_position(k, start, problem, components)
+        for k, start in zip(
+            jax.random.split(fill_key, chains), starts(start_key, problem, chains, components), strict=True
+        )
+    ]
+    keys = jax.random.split(chain_key, chains)
+    chain: MixtureChain = in_threads(run, [(k, problem, z) for k, z in zip(keys, begins, strict=True)])
+    flat = [jnp.asarray(x.reshape(chains * draws, *x.shape[2:])) for x in chain[:3]]
+    resolved = resolve_jit(jax.random.split(assign_key, chains * draws), *flat, problem)
+    n_steps = chain.transitions.n_steps
+    depth = np.floor(np.log2(np.maximum(n_steps, 1))).astype(int) + 1
+    stats = {
+        **chain.transitions._asdict(),
+        "tree_depth": depth,
+        "reached_max_treedepth": n_steps >= 2**max_tree_depth - 1,
+    }
+    method = "NUTS over weights and proportions, assignments and hidden steps summed out; exact assignments"
+    drawn = tuple(np.asarray(x) for x in chain[:3])
+    return mixture_data(key, problem, demonstration, present, drawn, resolved, stats, method)

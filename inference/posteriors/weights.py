@@ -1,0 +1,359 @@
+"""The posterior over reward weights and hidden steps, as ArviZ ``InferenceData``.
+
+NUTS moves in the weights alone, with the hidden steps summed out exactly; then each draw of the weights
+gets one joint completion of the demonstration by backward sampling. Together they are draws from
+``P(theta, hidden steps | what was perceived)``.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from functools import partial
+from typing import NamedTuple
+
+import arviz as az
+import jax
+import jax.numpy as jnp
+import numpy as np
+import numpyro
+import numpyro.distributions as dist
+import xarray as xr
+from jax import lax
+from jaxtyping import Array, Bool, Float, Int
+from numpyro.infer import NUTS
+from numpyro.infer.util import potential_energy
+
+from ...models.inputs.arguments import as_key
+from ...models.laws.chain import filter_all, sample_backward
+from ...models.laws.occlusion import ScaledPrior, occlusion_model, scaled_prior
+from ...models.observation.demonstration import PAD, UNKNOWN, Demonstration
+from ...models.observation.evidence import (
+    Imperfection,
+    checked_demonstration,
+    fitting_sensor,
+    require_possible,
+)
+from ...models.process.mdp import TabularMDP
+from ...models.process.planning import require_discounted, reward_of, soft_plan
+from ...version import __version__
+from ..completion.smoothing import Evidence, evidence_of, log_likelihoods
+from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
+
+
+class Problem(NamedTuple):
+    """Arguments of :func:`occlusion_model`, identical trajectories gathered."""
+
+    mdp: TabularMDP
+    sensor: Imperfection
+    codes: Int[Array, "u L 3"]
+    repeats: Int[Array, " u"]
+    prior: dist.Distribution
+
+
+class Chain(NamedTuple):
+    """One chain of NUTS: ``weights [draws, K]`` and what the sampler did."""
+
+    weights: Float[Array, "draws K"]
+    transitions: Transitions
+
+    @property
+    def diverging(self) -> Bool[Array, " draws"]:
+        """Of the transitions, ``[draws]``."""
+        return self.transitions.diverging
+
+
+def potential(position: Float[Array, " D"], problem: Problem) -> Float[Array, ""]:
+    """Negative log-density of the declared model at unconstrained weights."""
+    mdp, sensor, codes, repeats, prior = problem
+    options = {"prior": prior, "repeats": repeats}
+    return potential_energy(occlusion_model, (mdp, sensor, codes), options, {"weights": position})
+
+
+def nuts_chain(
+    key: Array,
+    problem: Problem,
+    start: Float[Array, " D"],
+    inverse_mass: Float[Array, "D D"],
+    *,
+    warmup: int,
+    draws: int,
+    target_accept: float = 0.8,
+    max_tree_depth: int = 10,
+) -> Chain:
+    """Run one chain of NUTS; traceable, so that chains and replications can be mapped over.
+
+    Starts at unconstrained weights ``start`` with a dense ``inverse_mass``; both that matrix and the step
+    size are adapted during ``warmup``.
+    """
+    kernel = NUTS(
+        potential_fn=lambda z: potential(z, problem),
+        dense_mass=True,
+        inverse_mass_matrix=inverse_mass,
+        step_size=0.5,
+        target_accept_prob=target_accept,
+        max_tree_depth=max_tree_depth,
+    )
+    return Chain(*run_nuts(key, kernel, start, dist.biject_to(problem.prior.support), warmup, draws))
+
+
+_run_chain = jax.jit(nuts_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
+_potential_and_gradient = jax.jit(jax.value_and_grad(potential))
+
+
+class Completions(NamedTuple):
+    """One joint completion of each trajectory for each draw of the weights.
+
+    ``states`` and ``actions`` ``[D, n, L]``, -1 beyond a trajectory's end.
+    """
+
+    states: Int[Array, "D n L"]
+    actions: Int[Array, "D n L"]
+
+
+def _evidence(problem: Problem) -> Evidence:
+    kind, state, action = (problem.codes[..., i] for i in range(3))
+    # Scores are not part of the declared model's event, so completions do not hear of them either.
+    demonstration = Demonstration(kind, state, action, jnp.full(kind.shape, jnp.nan))  # type: ignore[arg-type]
+    return evidence_of(problem.mdp, problem.sensor, demonstration)
+
+
+@jax.jit
+def complete(
+    keys: Array, weights: Float[Array, "D K"], problem: Problem, rows: Int[Array, " n"]
+) -> Completions:
+    """Draw a completion of each of the problem's trajectories ``rows`` for every draw of the weights."""
+    mdp, (log_evidence, live) = problem.mdp, _evidence(problem)
+
+    def one(inputs: tuple) -> Completions:
+        key, theta = inputs
+        factors = log_evidence + soft_plan(mdp, reward_of(mdp, theta)).log_policy
+        filtered = filter_all(mdp, factors, live)
+
+        def sample(key: Array, row: Int[Array, ""]) -> tuple:
+            passed = jax.tree.map(lambda x: x[row], filtered)
+            return sample_backward(key, mdp, factors[row], passed, live[row])
+
+        states, actions = jax.vmap(sample)(jax.random.split(key, rows.shape[0]), rows)
+        return Completions(states.astype(jnp.int32), actions.astype(jnp.int32))
+
+    # One draw at a time: a pass holds [n, L, S, A] factors, which draws should not multiply.
+    return lax.map(one, (keys, weights))
+
+
+@jax.jit
+def pointwise_log_likelihood(weights: Float[Array, "D K"], problem: Problem) -> Float[Array, "D u"]:
+    """Log-likelihood of each distinct trajectory under every draw of the weights."""
+    evidence = _evidence(problem)
+
+    def one(theta: Float[Array, " K"]) -> Float[Array, " u"]:
+        log_policy = soft_plan(problem.mdp, reward_of(problem.mdp, theta)).log_policy
+        return log_likelihoods(problem.mdp, log_policy, evidence)
+
+    return lax.map(one, weights)
+
+
+def posterior_mode(problem: Problem) -> Mode:
+    """The mode of the unconstrained density, climbed to from its origin.
+
+    The dissertation's estimate, were the prior flat; here only a place to start from.
+    """
+
+    size = dist.biject_to(problem.prior.support).inverse_shape(problem.prior.event_shape)
+    return mode_of(lambda x: _potential_and_gradient(x, problem), np.zeros(size))
+
+
+def gather(
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    demonstration: Demonstration,
+    prior: dist.Distribution | None = None,
+) -> tuple[Problem, Int[np.ndarray, " n"]]:
+    """The posterior's problem with identical trajectories gathered, and the row each trajectory became.
+
+    Most fragments of a little-seen expert are wholly hidden, hence identical. Rows are padded to a multiple
+    of eight, so that growing demonstrations meet few shapes.
+    """
+    sensor = fitting_sensor(sensor, mdp)
+    codes = np.asarray(checked_demonstration(mdp, demonstration).codes)
+    distinct, rows, repeats = np.unique(
+        codes.reshape(len(codes), -1), axis=0, return_inverse=True, return_counts=True
+    )
+    spare = -len(distinct) % 8
+    distinct = distinct.reshape(-1, *codes.shape[1:])
+    # A row of padding has probability one, whatever the weights.
+    distinct = np.concatenate([distinct, np.broadcast_to([PAD, UNKNOWN, UNKNOWN], (spare, *codes.shape[1:]))])
+    repeats = np.concatenate([repeats, np.ones(spare, int)])
+    prior = scaled_prior(mdp, prior)
+    return Problem(mdp, sensor, jnp.asarray(distinct, jnp.int32), jnp.asarray(repeats), prior), rows.ravel()
+
+
+def sample_posterior(
+    key: Array,
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    demonstration: Demonstration,
+    *,
+    prior: dist.Distribution | None = None,
+    draws: int = 500,
+    warmup: int = 300,
+    chains: int = 4,
+    completions: bool = True,
+    target_accept: float = 0.9,
+    max_tree_depth: int = 10,
+) -> az.InferenceData:
+    """Draw from the posterior over weights and hidden steps of :func:`occlusion_model`.
+
+    Chains start around the mode, dispersed twice as widely as its curvature suggests, and run in as many
+    threads as there are processors. The same key gives the same draws.
+
+    Parameters
+    ----------
+    key : JAX random key
+    mdp, sensor, demonstration
+        The decision process, how it was perceived, and what was perceived. Scores play no part.
+    prior : numpyro.distributions.Distribution, optional
+        Over ``K`` scaled weights (:mod:`~i2rl.models.process.units`), or over one and taken for each;
+        ``Normal(0, 2.5)`` by default, see :func:`~i2rl.models.weights_prior`. An expert who never errs is
+        fitted ever better by ever larger weights: it is the prior that ends this, and the weights' common
+        length depends on it.
+    draws, warmup, chains : int
+        Draws kept and discarded by each chain, and number of chains.
+    completions : bool
+        Whether to draw the hidden steps too.
+    target_accept, max_tree_depth
+        As in NumPyro's ``NUTS``.
+
+    Returns
+    -------
+    arviz.InferenceData
+        ``posterior``: ``weights (chain, draw, feature)``.
+        ``completions``: ``state``, ``action (chain, draw, trajectory, step)``, integer indices, -1 beyond a
+        trajectory's end; the draw of the hidden steps that belongs to the posterior's draw of the weights.
+        A group of its own, so that ``az.summary``, ``az.rhat`` and ``az.plot_trace`` are about weights.
+        ``log_likelihood``: ``demonstration (chain, draw, trajectory)``, for ``az.loo`` and ``az.compare``.
+        ``sample_stats``: ``lp``, ``energy``, ``acceptance_rate``, ``step_size``, ``n_steps``,
+        ``tree_depth``, ``reached_max_treedepth``, ``diverging``.
+        ``observed_data``: ``kind``, ``state``, ``action (trajectory, step)``.
+        ``constant_data``: ``state_name``, ``action_name``, which the indices refer to.
+
+    Raises
+    ------
+    DemonstrationError
+        Naming trajectory and step, if the MDP and the sensor rule an observation out.
+    ValueError
+        For an empty demonstration, a prior of another shape, numbers of draws or chains below one, or an
+        undiscounted MDP.
+    """
+    for name, number, least in (("draws", draws, 1), ("chains", chains, 1), ("warmup", warmup, 0)):
+        if number < least:
+            raise ValueError(f"{name} must be at least {least}, got {number}")
+    key, demonstration = as_key(key), checked_demonstration(mdp, demonstration)
+    if demonstration.n_trajectories == 0:
+        raise ValueError("the demonstration has no trajectories; without data the posterior is the prior")
+    require_discounted(mdp)
+    problem, rows = gather(mdp, sensor, demonstration, prior)
+    require_possible(sensor, mdp, demonstration)
+    mode = posterior_mode(problem)
+    start_key, chain_key, completion_key = jax.random.split(key, 3)
+    spread = 2.0 * np.linalg.cholesky(mode.covariance)
+    starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
+    run = partial(
+        _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
+    )
+    keys = jax.random.split(chain_key, chains)
+    chain: Chain = in_threads(
+        run, [(k, problem, x, mode.covariance) for k, x in zip(keys, starts, strict=True)]
+    )
+    flat = jnp.asarray(chain.weights.reshape(chains * draws, -1))
+    shape = (chains, draws, demonstration.n_trajectories)
+    log_likelihood = np.asarray(pointwise_log_likelihood(flat, problem))[:, rows].reshape(shape)
+    completed = None
+    if completions:
+        keys = jax.random.split(completion_key, chains * draws)
+        drawn = complete(keys, flat, problem, jnp.asarray(rows))
+        completed = Completions(*(x.reshape(*shape, -1) for x in drawn))
+    idata = _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
+    for attrs in (idata.attrs, idata["posterior"].attrs):
+        attrs["key"] = str(np.asarray(jax.random.key_data(key)).tolist())
+    return idata
+
+
+def _inference_data(
+    problem: Problem,
+    demonstration: Demonstration,
+    chain: Chain,
+    log_likelihood: Float[np.ndarray, "C D n"],
+    completions: Completions | None,
+    max_tree_depth: int,
+) -> az.InferenceData:
+    mdp = problem.mdp
+    n_steps = chain.transitions.n_steps
+    names = {
+        f"{kind}_name": (f"{kind}_index", np.asarray(labels))
+        for kind, labels in (("state", mdp.labels.states), ("action", mdp.labels.actions))
+        if labels is not None
+    }
+    attrs = {
+        "inference_library": "numpyro",
+        "inference_library_version": numpyro.__version__,
+        "i2rl_version": __version__,
+        "inference": "NUTS over weights, hidden steps summed out; backward sampling of completions",
+        "mdp_fingerprint": mdp.fingerprint(),
+        "sensor": type(problem.sensor).__name__,
+        "sensor_fingerprint": _fingerprint(problem.sensor),
+        "prior": _described(problem.prior),
+    }
+    steps = ["trajectory", "step"]
+    idata = az.from_dict(
+        posterior={"weights": chain.weights},
+        sample_stats={
+            **chain.transitions._asdict(),
+            "tree_depth": np.floor(np.log2(np.maximum(n_steps, 1))).astype(int) + 1,
+            "reached_max_treedepth": n_steps >= 2**max_tree_depth - 1,
+        },
+        log_likelihood={"demonstration": log_likelihood},
+        observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},
+        coords={"feature": list(mdp.feature_names)},
+        dims={
+            "weights": ["feature"], "demonstration": ["trajectory"],
+            "kind": steps, "state": steps, "action": steps,
+        },
+        attrs=attrs,
+        posterior_attrs=attrs,
+    )  # fmt: skip
+    groups = {}
+    if completions is not None:
+        grid = {dim: idata.log_likelihood[dim] for dim in ("chain", "draw", "trajectory")}
+        grid["step"] = idata.observed_data["step"]
+        groups["completions"] = xr.Dataset(
+            {
+                "state": (tuple(grid), np.asarray(completions.states)),
+                "action": (tuple(grid), np.asarray(completions.actions)),
+            },
+            coords=grid,
+            attrs=idata.posterior.attrs,
+        )
+    if names:
+        groups["constant_data"] = xr.Dataset(names)
+    if groups:
+        idata.add_groups(groups)
+    return idata
+
+
+def _fingerprint(tree: object) -> str:
+    digest = hashlib.sha256()
+    for leaf in jax.tree.leaves(tree):
+        array = np.ascontiguousarray(leaf)
+        digest.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
+    return digest.hexdigest()
+
+
+def _described(prior: dist.Distribution) -> str:
+    """A distribution with its parameters, through the wrappers that only shape it."""
+    if isinstance(prior, ScaledPrior):
+        scale, base = np.asarray(prior.scale), _described(prior.base)
+        return base if (scale == 1).all() else f"{base} on weights times {scale.tolist()}"
+    while hasattr(prior, "base_dist") and type(prior) in (dist.Independent, dist.ExpandedDistribution):
+        prior = prior.base_dist
+    values = (f"{name}={np.asarray(getattr(prior, name)).tolist()}" for name in prior.arg_constraints)
+    return f"{type(prior).__name__}({', '.join(values)})"

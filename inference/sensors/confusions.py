@@ -1,0 +1,67 @@
+"""A sensor's confusions learned from the demonstrations themselves, by expectation-maximisation."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...models.observation.demonstration import SEEN, UNKNOWN, Demonstration
+from ...models.observation.evidence import ObservationModel
+
+
+class ConfusionNoise(Protocol):
+    """Confusions whose probabilities can be learned: ``Confusions``, or ``SwapNoise``."""
+
+    @property
+    def noise(self) -> Float[Array, " M"]:
+        """Probability of each, where it acts."""
+
+    @property
+    def acts(self) -> Bool[Array, "M S A"]:
+        """Where each has something to confuse."""
+
+    @property
+    def reading(self) -> ObservationModel:
+        """The observation model."""
+
+    def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
+        """Which of them turned each truth into its report (flat indices)."""
+
+    def _replace(self, *, noise: Array = ...) -> Any:
+        """Itself with another ``noise``."""
+
+
+class ConfusionStatistic(NamedTuple):
+    """Expected numbers ``[M]``: how often each confusion happened, and how often it could have."""
+
+    happened: Float[Array, " M"]
+    possible: Float[Array, " M"]
+
+
+def confusion_counts(
+    noise: ConfusionNoise, pairs: Float[Array, "n L S A"], demonstration: Demonstration
+) -> ConfusionStatistic:
+    """The E-step: confusions counted over the posterior ``pairs`` of the truth.
+
+    Steps that were seen in part, or not at all, say nothing.
+    """
+    kind, state, action = (jnp.asarray(x) for x in demonstration[:3])
+    seen = (kind == SEEN) & (state != UNKNOWN) & (action != UNKNOWN)
+    _, n_states, n_actions = noise.acts.shape
+    size = n_states * n_actions
+    acts = noise.acts.reshape(-1, size).astype(float)
+    believed = pairs.reshape(-1, size) * seen.reshape(-1, 1)
+    report = jnp.where(seen, state * n_actions + action, 0).reshape(-1)
+    turned = noise.confused(jnp.tile(jnp.arange(size), len(report)), jnp.repeat(report, size))
+    turned = turned.reshape(len(report), size, -1).astype(float)
+    happened = jnp.einsum("tg,tgm,mg->m", believed, turned, acts)
+    return ConfusionStatistic(happened, jnp.einsum("tg,mg->m", believed, acts))
+
+
+def fitted_confusions(
+    assumed: ConfusionNoise, counts: ConfusionStatistic, trust: float
+) -> Float[Array, " M"]:
+    """The M-step: shares of what happened, the assumed probabilities counting as ``trust`` observations."""
+    return (trust * assumed.noise + counts.happened) / (trust + counts.possible)

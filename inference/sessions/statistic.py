@@ -1,0 +1,162 @@
+"""Sufficient statistics: all that an online learner keeps of the demonstrations it has seen (Definition 7).
+
+Three are offered, running averages over trajectories as in Eq. 4.2. They differ in what they keep of the
+steps that were *not* seen, and so in how much an early, poor guess at them weighs later:
+
+``features``
+    Discounted feature expectations of the completed, infinitely continued trajectories, the
+    dissertation's. With short fragments most of it is the tail filled in by the guess itself.
+``counts``
+    Expected visits ``N(s, a)`` of all steps. No tail, but hidden steps are still filled in once and kept.
+``seen``
+    Expected visits of the steps that were seen. Given the state, whether a step is in view says nothing
+    about its action, so the conditional likelihood of the seen actions is a proper (composite) likelihood;
+    the hidden steps of the current session count in full through its exact likelihood, and are then let go
+    rather than kept as a guess. With full observability it equals ``counts``. A noisy or partial reading is
+    kept as its posterior under the weights of its session.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol
+
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from ...models.laws.chain import Smoothed
+from ...models.process.mdp import TabularMDP
+from ...models.process.planning import SoftPlan, action_values, features_to_go, reward_of
+from ..completion.smoothing import Expectations, collect
+
+
+class FeatureStatistic(NamedTuple):
+    """``(n, phi_hat, start)``: trajectories, mean discounted features ``[K]``, start distribution ``[S]``."""
+
+    size: Float[Array, ""]
+    features: Float[Array, " K"]
+    start: Float[Array, " S"]
+
+
+class CountStatistic(NamedTuple):
+    """``(n, N)``: trajectories, and mean expected visits per trajectory ``[S, A]``."""
+
+    size: Float[Array, ""]
+    counts: Float[Array, "S A"]
+
+
+class Completed(NamedTuple):
+    """One session's demonstration completed under the current policy."""
+
+    expectations: Expectations
+    seen: Float[Array, "S A"]
+
+
+def complete(
+    mdp: TabularMDP, posterior: Smoothed, live: Bool[Array, "n L"], seen: Bool[Array, "n L"]
+) -> Completed:
+    """Collect what the statistics need from the posterior over a session's pairs."""
+    return Completed(
+        collect(mdp, posterior, live), jnp.einsum("nlsa,nl->sa", posterior.pairs, seen.astype(float))
+    )
+
+
+def blend(kept: Any, new: Any, memory: float = 1.0) -> Any:
+    """Running average of two statistics of one type, weighted by their sizes (Eq. 4.2).
+
+    ``memory`` is the exponent of the new one's share. At 1 everything counts alike; below, what was guessed
+    under early weights is slowly forgotten, as stochastic-approximation EM needs it (Cappe and Moulines 2009:
+    between 1/2 and 1).
+    """
+    total = kept.size + new.size
+    share = jnp.where(total > 0, new.size / jnp.where(total > 0, total, 1.0), 0.0) ** memory
+    merged = [(1 - share) * a + share * b for a, b in zip(kept[1:], new[1:], strict=True)]
+    return type(kept)(total, *merged)
+
+
+class Statistic(Protocol):
+    """How a learner summarises a session, keeps the summary, and fits weights to it."""
+
+    name: str
+
+    def empty(self, mdp: TabularMDP) -> Any:
+        """The statistic before the first session."""
+
+    def of_session(self, mdp: TabularMDP, plan: SoftPlan, completed: Completed) -> Any:
+        """The session's summary while it is the current one, under the policy it was completed with."""
+
+    def to_keep(self, mdp: TabularMDP, plan: SoftPlan, completed: Completed) -> Any:
+        """The session's summary once it is over."""
+
+    def slack(self, mdp: TabularMDP, epsilon: Any) -> Any:
+        """The program's slack ``beta`` for a relaxation ``epsilon``."""
+
+    def log_likelihood(
+        self, mdp: TabularMDP, weights: Float[Array, " K"], values: Float[Array, " S"], kept: Any
+    ) -> Float[Array, ""]:
+        """Mean log-likelihood per trajectory of what is kept, given weights and their soft values."""
+
+
+class _Features:
+    name = "features"
+
+    def empty(self, mdp: TabularMDP) -> FeatureStatistic:
+        return FeatureStatistic(jnp.zeros(()), jnp.zeros(mdp.n_features), jnp.zeros(mdp.n_states))
+
+    def of_session(self, mdp: TabularMDP, plan: SoftPlan, completed: Completed) -> FeatureStatistic:
+        # A fragment is a window on a task that goes on: its unseen future is hidden data too.
+        e = completed.expectations
+        features = e.features + e.tail @ features_to_go(mdp, plan.policy)
+        return FeatureStatistic(e.size, _mean(features, e.size), _mean(e.start, e.size))
+
+    to_keep = of_session
+
+    def slack(self, mdp: TabularMDP, epsilon: Any) -> Any:
+        """``beta = epsilon / (1 - gamma)``, the relaxed constraint of Theorem 1."""
+        return epsilon / (1 - mdp.discount)
+
+    def log_likelihood(self, mdp: TabularMDP, weights: Array, values: Array, kept: FeatureStatistic) -> Array:
+        """``sum_t gamma^t log pi(a_t | s_t)`` of the continued trajectories.
+
+        It telescopes to this in expectation over the dynamics.
+        """
+        return weights @ kept.features - kept.start @ values
+
+
+class _Counts:
+    name = "counts"
+
+    def empty(self, mdp: TabularMDP) -> CountStatistic:
+        return CountStatistic(jnp.zeros(()), jnp.zeros((mdp.n_states, mdp.n_actions)))
+
+    def of_session(self, mdp: TabularMDP, plan: SoftPlan, completed: Completed) -> CountStatistic:
+        e = completed.expectations
+        return CountStatistic(e.size, _mean(e.counts, e.size))
+
+    to_keep = of_session
+
+    def slack(self, mdp: TabularMDP, epsilon: Any) -> Any:
+        """``epsilon`` itself, in nats per trajectory and unit of weight."""
+        return epsilon
+
+    def log_likelihood(self, mdp: TabularMDP, weights: Array, values: Array, kept: CountStatistic) -> Array:
+        """``sum N log pi`` over the kept visits."""
+        log_policy = action_values(mdp, reward_of(mdp, weights), values) - values[:, None]
+        return jnp.sum(kept.counts * jnp.where(mdp.available, log_policy, 0.0))
+
+
+class _Seen(_Counts):
+    name = "seen"
+
+    def to_keep(self, mdp: TabularMDP, plan: SoftPlan, completed: Completed) -> CountStatistic:
+        size = completed.expectations.size
+        return CountStatistic(size, _mean(completed.seen, size))
+
+
+def _mean(total: Array, size: Array) -> Array:
+    return total / jnp.maximum(size, 1.0)
+
+
+FEATURES: Statistic = _Features()
+COUNTS: Statistic = _Counts()
+SEEN: Statistic = _Seen()
+STATISTICS: dict[str, Statistic] = {s.name: s for s in (SEEN, COUNTS, FEATURES)}

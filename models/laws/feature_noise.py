@@ -1,0 +1,218 @@
+"""The declared model of a sensor that errs on features of a pair, in PyMC (Bayesian reading of chapter 6.1).
+
+Reliabilities have Beta priors; what is known of the reports of any number of sessions is on how many of them
+each predicate was that of the truth, how likely each truth was, and how sure perception was. Where truths are
+hidden, they are the expectations that a posterior over them gives.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import Any
+
+import arviz as az
+import jax
+import numpy as np
+import pymc as pm
+import pytensor.tensor as pt
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from ..inputs.arguments import as_key
+from ..observation.agreement import PredicateClasses, ReportedMatches, predicate_classes
+
+
+def observation_feature_model(
+    predicates: ArrayLike,
+    reported: ReportedMatches,
+    *,
+    scores: ArrayLike | None = None,
+    reportable: ArrayLike | None = None,
+    prior: tuple[ArrayLike, ArrayLike] = (1.0, 1.0),
+    names: tuple[str, ...] | None = None,
+) -> pm.Model:
+    r"""PyMC model of the reliabilities of a :class:`FeatureNoise` sensor.
+
+    .. math::
+        p_j \sim \text{Beta}(a_j, b_j), \qquad
+        \log P(\text{reports} \mid p) = \sum_j n_j \, \text{logit} \, p_j - \sum_g w_g \log Z_g(p)
+
+    with :math:`n_j` the matches of predicate :math:`j` and :math:`w_g` the reports whose truth was :math:`g`:
+    Eq. 6.5, normalised. Its maximum over logits is the maximum-entropy program's answer. Where every
+    combination of predicates is reportable and equally common, :math:`p_j` is also how often predicate
+    :math:`j` is right, and the posterior is ``Beta(a + matches, b + reports - matches)``.
+
+    A score ``c_t`` is perception's calibrated confidence that its report is right, in agreement with its
+    truth on every predicate. The model gives that the probability ``mu(p)``, averaged over truths, and hears
+    the expectation ``sum_t c_t log mu + (1 - c_t) log(1 - mu)``. It is greatest where ``mu`` is the mean
+    score, as Eq. 6.6 has it, however scores are spread.
+
+    Parameters
+    ----------
+    predicates : bool or int ``[J, S, A]``
+    reported : ReportedMatches
+        Of all sessions so far; their counts add up.
+    scores : float ``[n]``, optional
+        In [0, 1]; NaN where perception gave none. Without scores ``score`` is not in the model.
+    reportable : bool ``[S, A]``, optional
+        Which pairs perception may report; all by default.
+    prior : pair of float or float ``[J]``
+        ``a`` and ``b``; uniform by default.
+    names : tuple of str, optional
+        Of the predicates, the coordinate ``predicate``; ``psi1``, ``psi2``, ... by default.
+
+    Returns
+    -------
+    pymc.Model
+        Free variable ``reliability (predicate)``; deterministic ``agreement (predicate)``, the probability
+        that a predicate is reported rightly, averaged over the truths; observed ``matches (predicate)`` and
+        ``score (report)``.
+
+    Raises
+    ------
+    ValueError
+        For bad predicates, matches that do not fit the reports, scores outside [0, 1], a prior that is not
+        positive, and another number of names than of predicates.
+    """
+    classes = predicate_classes(predicates, reportable)
+    n_predicates = classes.vectors.shape[1]
+    matches, truths = _checked_matches(classes, reported)
+    a, b = _checked_prior(prior, n_predicates)
+    names = _checked_names(names, n_predicates)
+    known = _checked_scores(scores)
+    said = classes.reportable > 0
+    agree, log_count = classes.agreements[:, said], np.log(classes.reportable[said])
+    # Reports in the truth's own class are those that agree on everything.
+    own = np.where(said, np.log(np.maximum(classes.reportable, 1.0)), -np.inf)
+    coords: dict[str, Any] = {"predicate": list(names)}
+    if len(known):
+        coords["report"] = np.arange(len(known))
+    with pm.Model(coords=coords) as model:
+        reliability = pm.Beta("reliability", a, b, dims="predicate")
+        logits = pt.log(reliability) - pt.log1p(-reliability)
+        exponents = pt.tensordot(pt.as_tensor(agree), logits, 1) + log_count
+        log_z = pt.logsumexp(exponents, axis=1)
+        chances = pt.exp(exponents - log_z[:, None])
+        share = truths / truths.sum()
+        pm.Deterministic(
+            "agreement",
+            pt.tensordot(share[:, None] * chances, pt.as_tensor(agree), [[0, 1], [0, 1]]),
+            dims="predicate",
+        )
+        pm.CustomDist(
+            "matches",
+            logits,
+            pt.dot(truths, log_z),
+            logp=_log_likelihood,
+            signature="(j),()->(j)",
+            observed=matches,
+            dims="predicate",
+        )
+        if len(known):
+            right = pt.dot(share, pt.exp(own + pt.sum(logits) - log_z))
+            pm.CustomDist("score", right, logp=_log_confidence, observed=known, dims="report")
+    return model
+
+
+def sample_observation_features(
+    key: Array,
+    predicates: ArrayLike,
+    reported: ReportedMatches,
+    *,
+    draws: int = 1000,
+    warmup: int = 500,
+    chains: int = 4,
+    target_accept: float = 0.9,
+    **model: Any,
+) -> az.InferenceData:
+    """Draw from the posterior of :func:`observation_feature_model`, with NUTS compiled by JAX.
+
+    No C compiler is needed. The same key gives the same draws.
+
+    Parameters
+    ----------
+    key : JAX random key
+    predicates, reported, **model
+        Of the model.
+    draws, warmup, chains : int
+        Draws kept and discarded by each chain, and number of chains.
+    target_accept : float
+        As in PyMC.
+
+    Returns
+    -------
+    arviz.InferenceData
+        ``posterior``: ``reliability``, ``agreement (chain, draw, predicate)``; ``sample_stats``;
+        ``observed_data``: ``matches``, ``score``.
+
+    Raises ``ValueError`` as the model does, and for numbers of draws or chains below one.
+    """
+    key = as_key(key)
+    for name, number in (("draws", draws), ("warmup", warmup), ("chains", chains)):
+        if number < 1:
+            raise ValueError(f"{name} must be at least 1, got {number}")
+    with warnings.catch_warnings(), observation_feature_model(predicates, reported, **model):
+        # JAX compiles all of this: what PyTensor's own compiler would want to link to does not matter.
+        warnings.filterwarnings("ignore", message="PyTensor could not link to a BLAS")
+        return pm.sample(
+            draws,
+            tune=warmup,
+            chains=chains,
+            target_accept=target_accept,
+            nuts_sampler="numpyro",
+            nuts_sampler_kwargs={"chain_method": "vectorized"},
+            random_seed=int(jax.random.bits(key, dtype=np.uint32)),
+            progressbar=False,
+            quiet=True,
+            compute_convergence_checks=False,
+        )
+
+
+def _log_likelihood(matches: pt.TensorVariable, logits: pt.TensorVariable, log_z: pt.TensorVariable) -> Any:
+    return pt.dot(logits, matches) - log_z
+
+
+def _log_confidence(scores: pt.TensorVariable, right: pt.TensorVariable) -> Any:
+    return scores * pt.log(right) + (1 - scores) * pt.log1p(-right)
+
+
+def _checked_matches(
+    classes: PredicateClasses, reported: ReportedMatches
+) -> tuple[Float[np.ndarray, " J"], Float[np.ndarray, " C"]]:
+    n_predicates = classes.vectors.shape[1]
+    matches, total = np.asarray(reported.matches, float), float(np.sum(reported.weights))
+    truths = total * classes.gather(reported.weights)
+    if matches.shape != (n_predicates,):
+        raise ValueError(f"{n_predicates} predicates need as many matches, got shape {list(matches.shape)}")
+    wrong = ~((matches >= -1e-9) & (matches <= total + 1e-9))
+    if wrong.any():
+        j = int(np.flatnonzero(wrong)[0])
+        raise ValueError(f"predicate {j} matched on {matches[j]:g} of {total:g} reports")
+    return matches, truths
+
+
+def _checked_prior(prior: tuple[ArrayLike, ArrayLike], n_predicates: int) -> tuple[np.ndarray, np.ndarray]:
+    a, b = (np.broadcast_to(np.asarray(x, float), (n_predicates,)) for x in prior)
+    if not ((a > 0) & (b > 0) & np.isfinite(a + b)).all():
+        raise ValueError(f"Beta priors need positive parameters, got a = {a.tolist()}, b = {b.tolist()}")
+    return a, b
+
+
+def _checked_names(names: tuple[str, ...] | None, n_predicates: int) -> tuple[str, ...]:
+    if names is None:
+        return tuple(f"psi{j + 1}" for j in range(n_predicates))
+    if len(names) != n_predicates or len(set(names)) != n_predicates:
+        raise ValueError(f"{n_predicates} predicates need as many names, all different; got {list(names)}")
+    return tuple(names)
+
+
+def _checked_scores(scores: ArrayLike | None) -> Float[np.ndarray, " n"]:
+    """Scores that were given."""
+    c = np.zeros(0) if scores is None else np.asarray(scores, float)
+    if c.ndim != 1:
+        raise ValueError(f"scores have shape [n], one for each report, got {list(c.shape)}")
+    wrong = (c < 0) | (c > 1)
+    if wrong.any():
+        t = int(np.flatnonzero(wrong)[0])
+        raise ValueError(f"scores lie between 0 and 1; that of report {t} is {c[t]}")
+    return c[~np.isnan(c)]

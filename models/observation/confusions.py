@@ -1,0 +1,106 @@
+"""Perception that takes some pairs for others, each confusion with a probability."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from ..inputs.arguments import concrete, is_traced, rebuilt_unchecked
+from .evidence import Imperfection, ObservationModel, Sensor
+
+
+class _ConfusionFields(NamedTuple):
+    reports: Int[Array, "M S A"]
+    noise: Float[Array, " M"]
+
+
+@rebuilt_unchecked
+class Confusions(_ConfusionFields):
+    """A pair is reported as another with the probability of the one confusion that acts on it.
+
+    An observation model that also injects its noise, and whose few probabilities can be learned.
+
+    Parameters
+    ----------
+    reports : int ``[M, S, A]``
+        What each confusion takes a pair for, as the flat index ``s * A + a``; the pair itself where it has
+        nothing to confuse. A pair is confused in one way at most.
+    noise : float ``[M]``
+        Probability of each, where it acts.
+
+    Raises
+    ------
+    ValueError
+        For probabilities outside [0, 1], indices of no pair, or two confusions of one pair.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, reports: np.ndarray | Array, noise: np.ndarray | Array) -> Confusions:
+        """Check and convert; see the class."""
+        flat = jnp.asarray(reports if is_traced(reports) else _checked(np.asarray(reports)))
+        p = concrete("noise", noise)
+        if p is not None:
+            if p.shape != flat.shape[:1]:
+                raise ValueError(f"{len(flat)} confusions need as many probabilities, got {list(p.shape)}")
+            for m in np.flatnonzero(~((p >= 0) & (p <= 1))):
+                raise ValueError(f"a confusion has a probability in [0, 1]; that of confusion {m} is {p[m]}")
+        return super().__new__(cls, flat, jnp.asarray(noise if p is None else p, float))
+
+    @staticmethod
+    def of_actions(
+        n_states: int, pairs: list[tuple[int, int]], noise: np.ndarray, n_actions: int
+    ) -> Confusions:
+        """``(truth, report)`` of actions, the same in every state; ``noise`` has an entry for each."""
+        reports = np.tile(np.arange(n_states * n_actions).reshape(n_states, n_actions), (len(pairs), 1, 1))
+        for m, (truth, report) in enumerate(pairs):
+            reports[m, :, truth] = reports[m, :, report]
+        return Confusions(reports, np.asarray(noise, float))
+
+    def __mul__(self, other: Imperfection) -> Sensor:  # type: ignore[override]
+        """Compose with another imperfection, such as a :class:`Visibility`."""
+        return self.reading * other
+
+    @property
+    def presence(self) -> None:
+        """Noise hides nothing."""
+        return None
+
+    @property
+    def acts(self) -> Bool[Array, "M S A"]:
+        """Where each confusion has something to confuse."""
+        return self.reports != jnp.arange(self.reports[0].size).reshape(self.reports.shape[1:])
+
+    @property
+    def reading(self) -> ObservationModel:
+        """``O(o | g)``: the noise at the confusion's report, the rest at the pair itself."""
+        shape, size = self.reports.shape[1:], self.reports[0].size
+        chance = jnp.where(self.acts, self.noise[:, None, None], 0.0).reshape(len(self.noise), size)
+        g = jnp.arange(size)
+        table = jnp.zeros((size, size)).at[g, g].add(1 - chance.sum(0))
+        table = table.at[g, self.reports.reshape(-1, size)].add(chance)
+        return ObservationModel._make((jnp.log(table).reshape(*shape, *shape),))
+
+    def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
+        """Which confusion turned each truth into its report (flat indices); none where none does."""
+        flat = self.reports.reshape(len(self.noise), -1)[:, truth]
+        return ((flat == report) & (flat != truth)).T
+
+
+def _checked(reports: np.ndarray) -> Int[np.ndarray, "M S A"]:
+    if reports.ndim != 3 or not reports.size or not np.issubdtype(reports.dtype, np.integer):
+        raise ValueError(
+            f"confusions are whole numbers of shape [M, S, A], got {reports.dtype} of {list(reports.shape)}"
+        )
+    size = reports[0].size
+    if reports.min() < 0 or reports.max() >= size:
+        wrong = reports.min() if reports.min() < 0 else reports.max()
+        raise ValueError(f"confusions name pairs by their flat index, 0 to {size - 1}; got {wrong}")
+    ways = (reports != np.arange(size).reshape(reports.shape[1:])).sum(0)
+    if ways.max() > 1:
+        s, a = np.argwhere(ways > 1)[0]
+        raise ValueError(f"the pair ({s}, {a}) is confused in {ways[s, a]} ways; at most one is possible")
+    return reports

@@ -1,0 +1,631 @@
+"""Imperfect perception, as evidence about hidden state-action pairs.
+
+Whatever a learner perceived at a step, the imperfection turns it into ``e_t(s, a)``, the probability of
+perceiving just that if the truth were ``(s, a)``. A sensor has two factors: *presence* (was the step in
+view at all?) and *reading* (what did perception report of a step in view?). Imperfections supply one or
+both and compose with ``*``.
+"""
+
+from __future__ import annotations
+
+from inspect import getattr_static
+from typing import Any, NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, Int
+
+from ..inputs.arguments import as_key, concrete, described, is_traced, rebuilt_unchecked
+from ..inputs.probabilities import normalised, sum_tolerance
+from ..process.mdp import TabularMDP, _PairNames
+from .demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
+
+
+class Imperfection(Protocol):
+    """Anything that turns what was perceived into evidence; methods never ask which one they were given."""
+
+    @property
+    def presence(self) -> Float[Array, " S"] | None:
+        """Probability that a step in each state is in view; None means always."""
+
+    @property
+    def reading(self) -> ObservationModel | None:
+        """What perception reports of a step in view; None means exactly the truth."""
+
+
+class _Composable:
+    """Products of imperfections."""
+
+    def __mul__(self: Imperfection, other: Imperfection) -> Sensor:
+        other = as_sensor(other)
+        if self.reading is not None and other.reading is not None:
+            raise ValueError("a sensor has one reading: two observation models cannot be multiplied")
+        if self.presence is None or other.presence is None:
+            presence = self.presence if other.presence is None else other.presence
+        else:
+            if self.presence.shape != other.presence.shape:
+                raise ValueError(
+                    f"views must be of one number of states to be multiplied; got shapes "
+                    f"{self.presence.shape} and {other.presence.shape}"
+                )
+            presence = self.presence * other.presence
+        return Sensor._make((presence, self.reading if other.reading is None else other.reading))
+
+
+class _SensorFields(NamedTuple):
+    presence: Float[Array, " S"] | None = None
+    reading: ObservationModel | None = None
+
+
+@rebuilt_unchecked
+class Sensor(_Composable, _SensorFields):  # type: ignore[misc]
+    """A product of imperfections; ``Sensor()`` sees everything exactly.
+
+    ``presence`` and ``reading`` may also be imperfections that have one. Raises ``ValueError`` for a presence
+    that is no probability and ``TypeError`` for a reading that reports nothing.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, presence: Any = None, reading: Any = None) -> Sensor:
+        """Check and convert; see the class."""
+        if presence is not None:
+            presence = presence.presence if _is_sensor(presence) else _checked_view("presence", presence)
+        if reading is not None and not hasattr(reading, "log_likelihood"):
+            if not _is_sensor(reading):
+                raise TypeError(f"reading must be an ObservationModel or None; got {described(reading)}")
+            reading = reading.reading
+        return super().__new__(cls, presence, reading)
+
+
+def _is_sensor(given: Any) -> bool:
+    # Looked up statically, as a reading may be a large table that is computed when it is asked for.
+    missing = object()
+    return not isinstance(given, type) and not any(
+        getattr_static(given, name, missing) is missing for name in ("presence", "reading")
+    )
+
+
+def as_sensor(given: Any) -> Imperfection:
+    """Take a sensor, or make a :class:`Visibility` of a mask of the states in view.
+
+    Raises ``TypeError`` for anything else and ``ValueError`` for a mask that is no probability.
+
+    Examples
+    --------
+    >>> as_sensor([True, False, True])
+    Visibility(in_view=Array([1., 0., 1.], dtype=float64))
+    """
+    if _is_sensor(given):
+        return given
+    plain = isinstance(given, list | tuple) and not hasattr(given, "_fields")
+    if plain or hasattr(given, "__array__"):
+        mask = concrete("sensor", given, None)
+        if mask is None or (mask.ndim == 1 and mask.dtype.kind in "bf"):
+            return Visibility(given)
+    raise TypeError(
+        "sensor must be a Visibility, an ObservationModel, another imperfection or a product of them, or a "
+        f"boolean mask [S] of the states in view; Sensor() sees everything; got {described(given)}"
+    )
+
+
+def _checked_view(name: str, given: Any) -> Float[Array, " S"]:
+    array = concrete(name, given)
+    if array is None:
+        return jnp.asarray(given, float)
+    if array.ndim != 1:
+        raise ValueError(f"{name} must have shape [S], got {array.shape}")
+    wrong = ~((array >= 0) & (array <= 1))
+    if wrong.any():
+        s = int(np.flatnonzero(wrong)[0])
+        raise ValueError(f"{name} must be a mask or probabilities in [0, 1]; that of state {s} is {array[s]}")
+    return jnp.asarray(array)
+
+
+class _VisibilityFields(NamedTuple):
+    in_view: Float[Array, " S"]
+
+
+@rebuilt_unchecked
+class Visibility(_Composable, _VisibilityFields):  # type: ignore[misc]
+    """A view that covers some states: ``in_view[s]`` is the probability of seeing a step in ``s``.
+
+    A boolean mask is the usual case. A step that is not seen is evidence that the expert is out of view.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, in_view: ArrayLike) -> Visibility:
+        """Check and convert ``in_view``; ``ValueError`` if it is no probability."""
+        return super().__new__(cls, _checked_view("in_view", in_view))
+
+    @property
+    def presence(self) -> Float[Array, " S"]:
+        """The view itself."""
+        return self.in_view
+
+    @property
+    def reading(self) -> None:
+        """What is in view is seen exactly."""
+        return None
+
+
+class _ObservationFields(NamedTuple):
+    log_probabilities: Float[Array, "S A S A"]
+
+
+@rebuilt_unchecked
+class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
+    """A full confusion of pairs: ``log O(o_s, o_a | s, a)`` as ``[S, A, S, A]``, truth first.
+
+    Build it from probabilities with :meth:`from_probabilities`, or from independent confusions of states
+    ``[S, S]`` and actions ``[A, A]`` with :meth:`from_factors`. Rows must sum to one within what the
+    precision of the given numbers allows, and are normalised to 64 bits.
+    """
+
+    __slots__ = ()
+
+    def __new__(cls, log_probabilities: ArrayLike) -> ObservationModel:
+        """Check and convert; ``ValueError`` unless the exponentials of each truth's row sum to one."""
+        table = concrete("log_probabilities", log_probabilities)
+        if table is None:
+            return super().__new__(cls, jnp.asarray(log_probabilities, float))
+        if np.isnan(table).any():
+            raise ValueError(f"log_probabilities must be numbers; that of {_first(np.isnan(table))} is nan")
+        with np.errstate(over="ignore"):
+            total = _row_sums(np.exp(table), log_probabilities)
+        inexact = np.abs(total - 1) > _KEPT
+        return super().__new__(cls, jnp.asarray(np.where(inexact, table - np.log(total), table)))
+
+    @staticmethod
+    def from_probabilities(probabilities: ArrayLike) -> ObservationModel:
+        """From ``O(o | s, a)`` as ``[S, A, S, A]``; ``ValueError`` unless each truth's row sums to one."""
+        o = concrete("observation probabilities", probabilities)
+        if o is None:
+            return ObservationModel._make((_log(jnp.asarray(probabilities, float)),))
+        if not np.isfinite(o).all() or (o < 0).any():
+            raise ValueError("observation probabilities must be non-negative numbers")
+        _row_sums(o, probabilities)
+        with np.errstate(divide="ignore"):
+            log_o = np.log(normalised(o, (2, 3)))
+        return ObservationModel._make((jnp.asarray(log_o),))
+
+    @staticmethod
+    def from_factors(states: ArrayLike, actions: ArrayLike) -> ObservationModel:
+        """States and actions confused independently: ``O = O_s(o_s | s) O_a(o_a | a)``."""
+        factors = []
+        for name, given in (("states", states), ("actions", actions)):
+            table = concrete(f"the confusion of {name}", given, None)
+            factors.append(jnp.asarray(given) if table is None else table)
+            if factors[-1].ndim != 2 or factors[-1].shape[0] != factors[-1].shape[1]:
+                raise ValueError(
+                    f"a confusion of {name} has shape [n, n], truth first, got {factors[-1].shape}"
+                )
+        einsum = jnp.einsum if any(is_traced(x) for x in factors) else np.einsum
+        return ObservationModel.from_probabilities(einsum("so,ap->saop", *factors))
+
+    @property
+    def presence(self) -> None:
+        """Noise hides nothing."""
+        return None
+
+    @property
+    def reading(self) -> ObservationModel:
+        """The model itself."""
+        return self
+
+    def log_likelihood(
+        self, state: Int[Array, ""], action: Int[Array, ""], score: Float[Array, ""]
+    ) -> Float[Array, "S A"]:
+        """``log O(o | s, a)`` of one report, for every truth; an unreported coordinate is summed out."""
+        del score  # a fixed confusion takes no account of confidence
+        table = self.log_probabilities
+        by_state = jnp.where(
+            state == UNKNOWN, _log(jnp.sum(jnp.exp(table), axis=2)), table[:, :, jnp.maximum(state, 0)]
+        )
+        summed = _log(jnp.sum(jnp.exp(by_state), axis=2))
+        return jnp.where(action == UNKNOWN, summed, by_state[:, :, jnp.maximum(action, 0)])
+
+    def report(
+        self, key: Array, state: Int[Array, ""], action: Int[Array, ""]
+    ) -> tuple[Int[Array, ""], Int[Array, ""]]:
+        """Draw what perception reports of a pair."""
+        flat = jax.random.categorical(key, self.log_probabilities[state, action].reshape(-1))
+        n_actions = self.log_probabilities.shape[1]
+        return flat // n_actions, flat % n_actions
+
+
+# Row sums that differ from one by less than this are rounding: normalised, a table would lose its own bits.
+_KEPT = 1e-12
+
+
+def _row_sums(o: np.ndarray, given: Any) -> Float[np.ndarray, "S A 1 1"]:
+    """Sum ``o [S, A, S, A]``, made of what was given; ``ValueError`` unless each truth's row sums to one."""
+    if o.ndim != 4 or o.shape[:2] != o.shape[2:]:
+        raise ValueError(f"an observation model has shape [S, A, S, A], truth first, got {o.shape}")
+    total = o.sum((2, 3), keepdims=True)
+    tolerance = sum_tolerance(np.asarray(given).dtype, o.shape[2] * o.shape[3])
+    if not np.abs(total - 1).max(initial=0) <= tolerance:
+        s, a, *_ = np.unravel_index(np.abs(total - 1).argmax(), total.shape)
+        raise ValueError(f"observation probabilities of pair ({s}, {a}) sum to {total[s, a, 0, 0]}, not 1")
+    return total
+
+
+def _first(wrong: np.ndarray) -> str:
+    return str(tuple(np.argwhere(wrong)[0].tolist()))
+
+
+class _NoiseFields(NamedTuple):
+    predicates: Bool[Array, "J S A"] | Int[Array, "J S A"]
+    reliabilities: Float[Array, " J"]
+    reportable: Bool[Array, "S A"]
+
+
+@rebuilt_unchecked
+class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
+    """Noise on features of a pair (6.1): ``O(o | g)`` by the predicates that ``o`` and ``g`` agree on.
+
+    ``O(o | g) = prod_j p_j^[psi_j(o) = psi_j(g)] (1 - p_j)^[psi_j(o) != psi_j(g)] / Z(g)``, normalised over
+    the pairs ``o`` that can be reported; Eq. 6.5 is that without ``Z``. A reliability ``p_j`` is a parameter,
+    not a frequency: how often a predicate is reported rightly is :meth:`agreement`.
+
+    Parameters
+    ----------
+    predicates : bool or int ``[J, S, A]``
+        ``psi_j(s, a)``. A predicate may be a label, such as the state's index: what counts is whether two
+        pairs have the same value.
+    reliabilities : float ``[J]``
+        ``p_j``, between 0 and 1; one half says nothing about its predicate.
+    reportable : bool ``[S, A]``, optional
+        Which pairs perception may report; all of them by default, unavailable ones too: perception does not
+        know the task.
+
+    Raises
+    ------
+    ValueError
+        For predicates that are neither true or false nor whole numbers, reliabilities outside (0, 1), or
+        shapes that do not fit.
+    """
+
+    __slots__ = ()
+
+    def __new__(
+        cls,
+        predicates: np.ndarray | Array,
+        reliabilities: np.ndarray | Array,
+        reportable: np.ndarray | Array | None = None,
+    ) -> FeatureNoise:
+        """Check and convert; see the class."""
+        psi = jnp.asarray(predicates if is_traced(predicates) else checked_predicates(predicates))
+        if reportable is None:
+            reportable = np.ones(psi.shape[1:], bool)
+        p = concrete("reliabilities", reliabilities)
+        if p is not None:
+            if p.shape != psi.shape[:1]:
+                raise ValueError(
+                    f"{psi.shape[0]} predicates need as many reliabilities, got shape {list(p.shape)}"
+                )
+            if not ((p > 0) & (p < 1)).all():
+                j = int(np.flatnonzero(~((p > 0) & (p < 1)))[0])
+                raise ValueError(f"reliabilities lie between 0 and 1; that of predicate {j} is {p[j]}")
+        mask = concrete("reportable", reportable, None)
+        if mask is not None:
+            if not np.isin(mask, (0, 1)).all():
+                raise ValueError(f"reportable must be true or false; got {mask[~np.isin(mask, (0, 1))][0]}")
+            if mask.shape != psi.shape[1:] or not mask.any():
+                raise ValueError(
+                    f"reportable must mark at least one of the pairs [S, A] = {list(psi.shape[1:])}, "
+                    f"got shape {list(mask.shape)} with {mask.sum()} marked"
+                )
+        return super().__new__(
+            cls,
+            psi,
+            jnp.asarray(reliabilities if p is None else p, float),
+            jnp.asarray(reportable if mask is None else mask, bool),
+        )
+
+    @property
+    def presence(self) -> None:
+        """Noise hides nothing."""
+        return None
+
+    @property
+    def reading(self) -> ObservationModel:
+        """The normalised observation model, which also injects the noise."""
+        return ObservationModel._make((self.log_probabilities,))
+
+    @property
+    def log_probabilities(self) -> Float[Array, "S A S A"]:
+        """``log O(o | g)``, truth first; ``-inf`` for what cannot be reported."""
+        n_predicates, *pairs = self.predicates.shape
+        psi = self.predicates.reshape(n_predicates, -1)
+        logits = jnp.log(self.reliabilities) - jnp.log1p(-self.reliabilities)
+        # Up to a term that no o changes: sum_j logit_j [psi_j(o) = psi_j(g)].
+        if psi.dtype == bool:
+            true, false = psi.astype(float), (~psi).astype(float)
+            exponents = (true * logits[:, None]).T @ true + (false * logits[:, None]).T @ false
+        else:
+            exponents = _same_labels(psi, logits)
+        table = jnp.where(self.reportable.reshape(-1), exponents, -jnp.inf)
+        return jax.nn.log_softmax(table, axis=1).reshape(*pairs, *pairs)
+
+    def agreement(self) -> Float[Array, "J S A"]:
+        """Probability that each predicate of a report is that of the truth ``(s, a)``."""
+        psi = self.predicates.reshape(self.predicates.shape[0], -1)
+        table = jnp.exp(self.log_probabilities).reshape(psi.shape[1], -1)
+        same = jax.lax.map(lambda labels: jnp.sum(table, 1, where=labels[:, None] == labels), psi)
+        return same.reshape(self.predicates.shape)
+
+
+def _same_labels(psi: Int[Array, "J SA"], logits: Float[Array, " J"]) -> Float[Array, "SA SA"]:
+    """``sum_j logit_j [psi_j(o) = psi_j(g)]``, one predicate at a time, in its derivative too."""
+
+    # Kept for a derivative, who agrees with whom would be [J, SA, SA].
+    @jax.checkpoint
+    def add(total: Array, one: tuple[Array, Array]) -> tuple[Array, None]:
+        labels, logit = one
+        return total + jnp.where(labels[:, None] == labels, logit, 0.0), None
+
+    return jax.lax.scan(add, jnp.zeros((psi.shape[1], psi.shape[1])), (psi, logits))[0]
+
+
+def checked_predicates(predicates: ArrayLike) -> Bool[np.ndarray, "J S A"] | Int[np.ndarray, "J S A"]:
+    """Predicates as booleans if they are true or false, else as whole numbers; ``ValueError`` otherwise."""
+    masked = isinstance(predicates, np.ma.MaskedArray)
+    psi = np.asarray(concrete("predicates", predicates, None) if masked else predicates)
+    if psi.ndim != 3 or not psi.size:
+        raise ValueError(f"predicates have shape [J, S, A], got {list(psi.shape)}")
+    if psi.dtype.kind not in "biuf":
+        raise ValueError(f"predicates are true or false, or whole numbers; got entries of type {psi.dtype}")
+    broken = ~np.isfinite(psi) | (psi != np.rint(psi)) if psi.dtype.kind == "f" else np.zeros(psi.shape, bool)
+    if broken.any():
+        j, s, a = np.argwhere(broken)[0]
+        raise ValueError(
+            f"predicates are true or false, or whole numbers; predicate {j} of the pair ({s}, {a}) "
+            f"is {psi[j, s, a]}"
+        )
+    return psi.astype(bool) if np.isin(psi, (0, 1)).all() else psi.astype(int)
+
+
+def fitting_sensor(sensor: Any, mdp: TabularMDP) -> Imperfection:
+    """Take a sensor, or a mask of the states in view, that fits the process.
+
+    Raises ``TypeError`` as :func:`as_sensor` does, and ``ValueError`` for a sensor that was made for another
+    number of states or actions than the MDP has.
+    """
+    sensor = as_sensor(sensor)
+    if sensor.presence is not None and sensor.presence.shape[-1:] != (mdp.n_states,):
+        raise ValueError(
+            f"the sensor's view has shape {sensor.presence.shape}, but the MDP has {mdp.n_states} states"
+        )
+    table = getattr(sensor.reading, "log_probabilities", None)
+    if table is not None and table.shape[-2:] != (mdp.n_states, mdp.n_actions):
+        raise ValueError(
+            f"the observation model is about {table.shape[-2]} states and {table.shape[-1]} actions, "
+            f"but the MDP has {mdp.n_states} and {mdp.n_actions}"
+        )
+    return sensor
+
+
+def checked_demonstration(
+    mdp: TabularMDP,
+    demonstration: Demonstration,
+    *,
+    needed_by: str | None = None,
+    record: str = "trajectory",
+) -> Demonstration:
+    """Check that a demonstration is about the states and actions of a process; traced ones pass.
+
+    Every learner, law and metric calls it before it compiles anything. Inside compiled programs
+    :func:`step_log_evidence` gives such steps the probability zero.
+
+    Parameters
+    ----------
+    needed_by : str, optional
+        Name of what cannot do without a single step ("a session"); empty demonstrations pass without.
+    record : str
+        Name of a row in messages.
+
+    Raises
+    ------
+    TypeError
+        For an object of another type.
+    DemonstrationError
+        Naming trajectory and step: an index of no state or action, a kind that does not exist, a score
+        outside [0, 1], padding before a step; arrays of different shapes or of no whole numbers.
+    """
+    if not isinstance(demonstration, Demonstration):
+        raise TypeError(
+            "demonstration must be a Demonstration, such as Demonstration.from_pairs(states, actions) or "
+            f"Demonstration.from_steps(trajectories, mdp) makes; got {described(demonstration)}"
+        )
+    if any(is_traced(x) for x in demonstration):
+        return demonstration
+    checked = Demonstration(*(np.asarray(x) for x in demonstration))
+    _check_codes(mdp, *checked[:3], record)
+    score = checked.score
+    if score.shape != checked.kind.shape:
+        raise DemonstrationError(
+            f"a demonstration has arrays of one shape [n, L]; got kind {checked.kind.shape} and score "
+            f"{score.shape}"
+        )
+    wrong = (checked.kind == SEEN) & ((score < 0) | (score > 1))
+    if wrong.any():
+        i, t = np.argwhere(wrong)[0]
+        raise DemonstrationError(f"{record} {i}, step {t}: score must lie in [0, 1], got {score[i, t]}")
+    if needed_by is not None and not (checked.kind != PAD).any():
+        raise DemonstrationError(f"{needed_by} needs at least one trajectory with a step")
+    return checked
+
+
+def checked_codes(mdp: TabularMDP, codes: ArrayLike) -> Int[Array, "... L 3"]:
+    """Check :attr:`Demonstration.codes` as :func:`checked_demonstration` does; traced ones pass."""
+    if not is_traced(codes):
+        array = np.asarray(codes)
+        flat = array.reshape(-1, *array.shape[-2:])
+        if flat.shape[-1] == 3:
+            _check_codes(mdp, flat[..., 0], flat[..., 1], flat[..., 2], "trajectory")
+    return jnp.asarray(codes)
+
+
+def _check_codes(
+    mdp: TabularMDP, kind: np.ndarray, state: np.ndarray, action: np.ndarray, record: str
+) -> None:
+    if not kind.shape == state.shape == action.shape or kind.ndim != 2:
+        raise DemonstrationError(
+            f"a demonstration has arrays of one shape [n, L]; got kind {kind.shape}, state {state.shape} and "
+            f"action {action.shape}"
+        )
+    for name, array in (("kind", kind), ("state", state), ("action", action)):
+        if array.dtype.kind not in "iu":
+            raise DemonstrationError(f"{name} must be an array of whole numbers; got {array.dtype}")
+    wrong = (kind < PAD) | (kind > LOST)
+    if wrong.any():
+        i, t = np.argwhere(wrong)[0]
+        raise DemonstrationError(
+            f"{record} {i}, step {t}: kind must be PAD, SEEN, HIDDEN or LOST (0 to 3), got {kind[i, t]}"
+        )
+    seen = kind == SEEN
+    for index, what, count in ((state, "state", mdp.n_states), (action, "action", mdp.n_actions)):
+        wrong = seen & ((index < UNKNOWN) | (index >= count))
+        if wrong.any():
+            i, t = np.argwhere(wrong)[0]
+            raise DemonstrationError(
+                f"{record} {i}, step {t}: {what} {index[i, t]} is out of range; "
+                f"indices run from 0 to {count - 1}"
+            )
+    wrong = (kind[:, 1:] != PAD) & (kind[:, :-1] == PAD)
+    if wrong.any():
+        i, t = np.argwhere(wrong)[0]
+        raise DemonstrationError(f"{record} {i}, step {t}: padding comes last, but step {t + 1} is a step")
+
+
+def step_log_evidence(
+    sensor: Imperfection,
+    n_states: int,
+    n_actions: int,
+    kind: Int[Array, ""],
+    state: Int[Array, ""],
+    action: Int[Array, ""],
+    score: Float[Array, ""],
+) -> Float[Array, "S A"]:
+    """``log e_t(s, a)`` of one step; zero (no evidence) for lost frames and padding.
+
+    Minus infinity for what cannot be perceived: an index of no state or action, or another kind.
+    """
+    shape = (n_states, n_actions)
+    presence = jnp.ones(n_states) if sensor.presence is None else sensor.presence
+    if sensor.reading is None:
+        match_state = (state == UNKNOWN) | (jnp.arange(n_states) == state)
+        match_action = (action == UNKNOWN) | (jnp.arange(n_actions) == action)
+        reading = jnp.where(match_state[:, None] & match_action, 0.0, -jnp.inf)
+    else:
+        reading = sensor.reading.log_likelihood(state, action, score)
+    seen = reading + _log(presence)[:, None]
+    hidden = jnp.broadcast_to(_log(1 - presence)[:, None], shape)
+    # An index beyond an array is clamped to its last entry: it would be learned from as another state.
+    in_range = (state >= UNKNOWN) & (state < n_states) & (action >= UNKNOWN) & (action < n_actions)
+    nothing = jnp.where((kind == LOST) | (kind == PAD), jnp.zeros(shape), -jnp.inf)
+    return jnp.where((kind == SEEN) & in_range, seen, jnp.where(kind == HIDDEN, hidden, nothing))
+
+
+def _log(probability: Array) -> Array:
+    """Logarithm with ``log 0 = -inf`` and a zero, not NaN, gradient there."""
+    return jnp.where(probability > 0, jnp.log(jnp.where(probability > 0, probability, 1.0)), -jnp.inf)
+
+
+def log_evidence(
+    sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration
+) -> Float[Array, "n L S A"]:
+    """``log e_t(s, a)`` of every step of every trajectory.
+
+    Raises ``ValueError`` for a sensor made for another number of states or actions, and as
+    :func:`checked_demonstration` does.
+    """
+    sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
+    step = jax.vmap(jax.vmap(lambda *x: step_log_evidence(sensor, mdp.n_states, mdp.n_actions, *x)))
+    kind, state, action, score = (jnp.asarray(x) for x in demonstration)
+    return step(kind, state, action, score)
+
+
+def observe(
+    key: Array, sensor: Imperfection, states: Int[Array, " L"], actions: Int[Array, " L"]
+) -> Int[Array, "L 3"]:
+    """Pass a true trajectory through a sensor: codes (kind, state, action) of what is perceived."""
+
+    sensor = as_sensor(sensor)
+
+    def one(key: Array, state: Int[Array, ""], action: Int[Array, ""]) -> Int[Array, " 3"]:
+        look, read = jax.random.split(key)
+        seen: Bool[Array, ""] = jnp.array(True)
+        if sensor.presence is not None:
+            seen = jax.random.uniform(look) < sensor.presence[state]
+        if sensor.reading is not None:
+            state, action = sensor.reading.report(read, state, action)
+        values = jnp.stack([jnp.array(SEEN), state, action])
+        return jnp.where(seen, values, jnp.array([HIDDEN, UNKNOWN, UNKNOWN])).astype(jnp.int32)
+
+    keys = jax.random.split(as_key(key), states.shape[0])
+    return jax.vmap(one)(keys, states, actions)
+
+
+_evidence = jax.jit(step_log_evidence, static_argnums=(1, 2))
+
+
+def require_possible(
+    sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration, record: str = "trajectory"
+) -> None:
+    """Raise :class:`DemonstrationError` at the first step that no behaviour of the MDP could have produced.
+
+    Follows the set of states that could still be true; ``record`` names what a row is in the message. An
+    index of no state or action is such a step too.
+    """
+    sensor = fitting_sensor(sensor, mdp)
+    demonstration = checked_demonstration(mdp, demonstration, record=record)
+    successors, possible_move = np.asarray(mdp.successors), np.asarray(mdp.probabilities) > 0
+    available = np.asarray(mdp.available)
+    name = _PairNames(mdp.labels)
+    names = {SEEN: "seen", HIDDEN: "hidden", LOST: "lost"}
+    start = np.asarray(mdp.initial) > 0
+    presence = np.ones(mdp.n_states) if sensor.presence is None else np.asarray(sensor.presence)
+    for i in range(demonstration.n_trajectories):
+        states = start
+        for t, (kind, s, a, score) in enumerate(zip(*(np.asarray(x)[i] for x in demonstration), strict=True)):
+            if kind == PAD:
+                break
+            if kind == SEEN and sensor.reading is None:
+                pairs = np.zeros_like(available)
+                pairs[slice(None) if s == UNKNOWN else s, slice(None) if a == UNKNOWN else a] = True
+                pairs &= (presence > 0)[:, None]
+            elif kind == SEEN:
+                pairs = (
+                    np.asarray(_evidence(sensor, mdp.n_states, mdp.n_actions, kind, s, a, score)) > -np.inf
+                )
+            elif kind == HIDDEN:
+                pairs = np.broadcast_to((presence < 1)[:, None], available.shape)
+            else:
+                pairs = np.ones_like(available)
+            allowed = pairs & available
+            if not (allowed & states[:, None]).any():
+                seen = ""
+                if kind == SEEN:
+                    seen = " " + ", ".join(
+                        ([] if s == UNKNOWN else [f"state {name.state(s)}"])
+                        + ([] if a == UNKNOWN else [f"action {name.action(a)}"])
+                    )
+                if not pairs.any():
+                    reason = "the sensor excludes it" if kind == SEEN else "every state is in view"
+                elif not allowed.any():
+                    reason = "the action is not available there"
+                elif t == 0:
+                    reason = "the initial distribution excludes it"
+                else:
+                    reason = "no transition leads there from the step before"
+                raise DemonstrationError(
+                    f"{record} {i}, step {t}: impossible observation: {names[int(kind)]}{seen}; {reason}"
+                )
+            taken = allowed & states[:, None]
+            states = np.zeros(mdp.n_states, bool)
+            states[successors[taken][possible_move[taken]]] = True
