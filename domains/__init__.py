@@ -7,8 +7,9 @@ are imported when they are first used: they need the extra ``adversarial``.
 import importlib
 from typing import Any
 
-from .environments import TabularEnv
-from .labyrinth.process import Bout, Labyrinth, labyrinth, read_bouts, simulate_bouts
+from . import environments  # noqa: F401  (registers them)
+from .gym.tabular import TabularEnv
+from .labyrinth.process import Bout, Labyrinth, mouse_labyrinth, read_bouts, simulate_bouts
 from .noisy.swap_noise import SwapNoise
 from .noisy.tasks import (
     NoisyDemonstration,
@@ -18,7 +19,7 @@ from .noisy.tasks import (
     noisy_patrol,
     noisy_sorting,
 )
-from .object_world.process import ObjectWorld, object_world, walled_world, without_blocked_moves
+from .object_world.process import ObjectWorld, random_object_world, walled_world, without_blocked_moves
 from .patrol.environment import BreachEnv
 from .patrol.process import (
     Interaction,
@@ -73,10 +74,10 @@ __all__ = [
     "four_hallways",
     "greedy_policies",
     "instance",
-    "labyrinth",
+    "mouse_labyrinth",
     "noisy_patrol",
     "noisy_sorting",
-    "object_world",
+    "random_object_world",
     "pick_inspect_place",
     "random_policies",
     "read_bouts",

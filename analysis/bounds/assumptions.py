@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from ...inference.sessions.session import Learner
+from ...inference.sessions.learner import Learner
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import feature_expectations, reward_of, soft_plan
 from ...models.process.units import feature_scale

@@ -18,10 +18,10 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import digamma, polygamma
 
+from .checks import positive
+
 # Largest bet of the predictable intervals; Waudby-Smith and Ramdas (2023) recommend 1/2 or 3/4.
 _LARGEST_BET = 0.75
-# The squares of smaller errors, and the sizes that they ask for, leave the range of floats.
-_LEAST = 1e-60
 
 
 class Interval(NamedTuple):
@@ -119,12 +119,12 @@ def _cost(bets: np.ndarray) -> np.ndarray:
 
 def hoeffding_size(error: float, delta: float) -> float:
     """Size at which Hoeffding's half-width is ``error``: ``log(2 / delta) / (2 error^2)``, unrounded."""
-    return _log(delta) / (2 * _positive("error", error) ** 2)
+    return _log(delta) / (2 * positive("error", error) ** 2)
 
 
 def hoeffding_error(size: float, delta: float) -> float:
     """Hoeffding's half-width after ``size`` values."""
-    return float(np.sqrt(_log(delta) / (2 * _positive("size", size))))
+    return float(np.sqrt(_log(delta) / (2 * positive("size", size))))
 
 
 def bernstein_size(deviation: float, error: float, delta: float) -> int:
@@ -133,7 +133,7 @@ def bernstein_size(deviation: float, error: float, delta: float) -> int:
     ``deviation`` is the values' standard deviation, taken to be what will be observed: a plan, while the
     guarantee is the interval computed from the data themselves.
     """
-    _positive("error", error)
+    positive("error", error)
     return smallest(lambda n: _bernstein(np.asarray(deviation**2), n, delta) <= error, least=2)
 
 
@@ -165,7 +165,7 @@ def _blocks(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 def predictable_size(deviation: float, error: float, delta: float) -> int:
     """Smallest size at which :func:`predictable_bernstein` is as narrow as ``error``; a plan likewise."""
-    _positive("error", error)
+    positive("error", error)
     return smallest(lambda n: predictable_half_width(deviation, n, delta) <= error)
 
 
@@ -187,14 +187,6 @@ def _log(delta: float) -> float:
     if not 0 < delta < 1:
         raise ValueError(f"a failure probability lies strictly between 0 and 1, got {delta}")
     return float(np.log(2 / delta))
-
-
-def _positive(name: str, x: float) -> float:
-    if not (np.isfinite(x) and x > 0):
-        raise ValueError(f"{name} must be positive, got {x}")
-    if x < _LEAST:
-        raise ValueError(f"{name} must be at least {_LEAST}, got {x}")
-    return x
 
 
 def _in_unit_interval(values: Float[np.ndarray, "... n K"], least: int = 1) -> np.ndarray:

@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, Int
 from ...inference.learners.lme import lme_i2rl
 from ...inference.programs.constraints import FeatureTarget
 from ...inference.programs.maximum_entropy import solve_dual
-from ...inference.sessions.session import fleet
+from ...inference.sessions.fleets import fleet
 from ...models.laws.chain import filter_all, sample_backward, smooth_all
 from ...models.observation.demonstration import Demonstration
 from ...models.observation.evidence import Imperfection, observe, step_log_evidence

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ...models.observation.evidence import Imperfection
-from .theorems import _counted, _positive
+from .checks import counted, positive
 
 
 class Perception(NamedTuple):
@@ -81,7 +81,7 @@ class ModelDistance(NamedTuple):
 
     def over(self, steps: int) -> tuple[float, float]:
         """Bounds of the total variation of a trajectory's reports, and of the posterior over trajectories."""
-        _counted("steps", steps)
+        counted("steps", steps)
         return _over_steps(self.variation, steps), math.tanh(steps * self.odds / 4)
 
 
@@ -117,8 +117,8 @@ def _over_steps(variation: float, steps: int) -> float:
 
 
 def _error(perception: Perception) -> float:
-    _counted("predicates", perception.predicates), _counted("longest", perception.longest)
-    return _positive("epsilon_o", perception.epsilon_o)
+    counted("predicates", perception.predicates), counted("longest", perception.longest)
+    return positive("epsilon_o", perception.epsilon_o)
 
 
 def _intervals(

@@ -70,14 +70,10 @@ from .assumptions import (
     WHOLE,
     Bound,
 )
+from .checks import counted, counted_sessions, discounted, positive, probability
 from .distance import Perception, posterior_distance, report_distance
 from .theorems import (
     Regret,
-    _counted,
-    _discounted,
-    _positive,
-    _probability,
-    _session_sizes,
     failure_probability,
     lme_constraint_bound,
     no_regret,
@@ -98,7 +94,7 @@ def rimeo_constraint_bound(
     proved.
     """
     lemma = lme_constraint_bound(size, samples, epsilon, epsilon_s, n_features)
-    _counted("predicates", perception.predicates), _counted("longest", perception.longest)
+    counted("predicates", perception.predicates), counted("longest", perception.longest)
     deltas = (
         failure_probability(size, epsilon, n_features),
         failure_probability(samples, epsilon_s, n_features),
@@ -188,7 +184,7 @@ def rimeo_confidence(
     return Bound(
         "Theorem 6 of appendix E",
         "LL(theta_E) - LL(theta) <= 2 K epsilon_r / (1 - gamma)",
-        2 * n_features * lemma.error / (1 - _discounted(discount)),
+        2 * n_features * lemma.error / (1 - discounted(discount)),
         lemma.confidence,
         lemma.error,
         (*EXPERT, COMPLETION, OBSERVATION, PREDICATES_SEEN, *PROGRAM_SOLVED),
@@ -203,13 +199,13 @@ def noisy_confidence(lemma: Bound, n_features: int, discount: float, norm: float
     the program with slack ``epsilon_r / (1 - gamma)``. ``norm`` is ``|theta_E|_1``; without it the ``K`` of
     weights in [0, 1].
     """
-    _counted("n_features", n_features)
-    size = n_features if norm is None else _positive("norm", norm)
+    counted("n_features", n_features)
+    size = n_features if norm is None else positive("norm", norm)
     premises = {a.name: a for a in (*EXPERT, *lemma.assumptions, *PROGRAM_SOLVED)}
     return lemma._replace(
         source="Theorem 6 of appendix E, corrected",
         statement="LL(theta_E) - LL(theta) <= 2 |theta_E|_1 epsilon_r / (1 - gamma)",
-        error=2 * size * lemma.error / (1 - _discounted(discount)),
+        error=2 * size * lemma.error / (1 - discounted(discount)),
         assumptions=tuple(premises.values()),
     )
 
@@ -224,10 +220,10 @@ def perception_needed(
     (``n_o``) and ``epsilon_o``. Raises ``ValueError`` for an error outside (0, 1], a confidence outside (0,
     1), or counts below 1.
     """
-    _counted("predicates", predicates), _counted("longest", longest)
+    counted("predicates", predicates), counted("longest", longest)
     if not 0 < error <= 1:
         raise ValueError(f"the error of an average of values in [0, 1] lies in (0, 1], got {error}")
-    delta, factors = 1 - _probability("confidence", confidence), longest * predicates
+    delta, factors = 1 - probability("confidence", confidence), longest * predicates
     printed, corrected = error / 3 / factors, -math.expm1(math.log1p(-error / 2) / factors)
     share, half = size_for(error / 3, delta / 3, n_features), size_for(error / 2, delta / 2, n_features)
     known = size_for(printed, delta / 3, n_features * predicates), size_for(corrected, delta / 2, predicates)
@@ -263,18 +259,18 @@ def rimeo_no_regret(
     i`` and sessions of one size the average falls as ``log T / T`` only. The theorem holds of a learner that
     completes all sessions again.
     """
-    _counted("predicates", predicates), _counted("longest", longest)
+    counted("predicates", predicates), counted("longest", longest)
     plain = no_regret(c, session_sizes, n_features, discount)
     i = np.arange(1, len(plain.average) + 1)
     third = c * (1 - discount) / i / 3
-    samples, reports = _session_sizes(session_samples), _session_sizes(session_reports)
+    samples, reports = counted_sessions(session_samples), counted_sessions(session_reports)
     if not len(samples) == len(reports) == len(i):
         raise ValueError(
             f"{len(i)} session sizes, but {len(samples)} numbers of samples and {len(reports)} of reports"
         )
     epsilon_o = third / (longest * predicates)
     delta = 2 * n_features * (
-        np.exp(-2 * np.cumsum(_session_sizes(session_sizes)) * third**2)
+        np.exp(-2 * np.cumsum(counted_sessions(session_sizes)) * third**2)
         + np.exp(-2 * samples * third**2)
         + predicates * np.exp(-2 * np.cumsum(reports) * epsilon_o**2)
     )  # fmt: skip
@@ -296,11 +292,11 @@ def rimeo_no_regret_sizes(
     The failure probability is spent as in :func:`~i2rl.analysis.bounds.theorems.no_regret_sizes`, in thirds:
     what a session adds grows about linearly, its draws with the square. Indexed by session, from 1.
     """
-    _positive("c", c), _counted("sessions", sessions), _counted("n_features", n_features)
-    _counted("predicates", predicates), _counted("longest", longest)
+    positive("c", c), counted("sessions", sessions), counted("n_features", n_features)
+    counted("predicates", predicates), counted("longest", longest)
     i = np.arange(1, sessions + 1)
-    spent = 2 * _probability("delta", delta) / (np.pi * i) ** 2
-    third = c * (1 - _discounted(discount)) / i / 3
+    spent = 2 * probability("delta", delta) / (np.pi * i) ** 2
+    third = c * (1 - discounted(discount)) / i / 3
     size = np.log(2 * n_features / spent) / (2 * third**2)
     known = np.log(2 * n_features * predicates / spent) / 2 * (longest * predicates / third) ** 2
     return pd.DataFrame(

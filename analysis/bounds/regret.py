@@ -35,7 +35,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
-from ...inference.sessions.session import Learner, Report, average_regret, run_streams
+from ...inference.sessions.fleets import run_streams
+from ...inference.sessions.learner import Learner, Report
+from ...inference.sessions.running import average_regret
 from ...inference.sessions.statistic import STATISTICS
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP

@@ -7,7 +7,7 @@ there is worse, by more than ``margin``, than what the same stream settles at, t
 LBA, which needs the expert: it judges rules, and no rule sees it. A rule that never fires within the
 stream has made no false stop, and has saved nothing.
 
-The rules themselves are those of :mod:`i2rl.inference.sessions.session`; here each is applied to all streams
+The rules themselves are those of :mod:`i2rl.inference.sessions.stopping`; here each is applied to all streams
 at once.
 """
 

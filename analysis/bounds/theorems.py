@@ -45,9 +45,9 @@ from .assumptions import (
     WHOLE,
     Bound,
 )
+from .checks import counted, counted_sessions, discounted, positive, probability
 from .concentration import (
     Interval,
-    _positive,
     empirical_bernstein,
     predictable_bernstein,
     predictable_half_width,
@@ -59,7 +59,7 @@ from .concentration import (
 
 def failure_probability(size: float, error: float, events: float) -> float:
     """``delta = 2 events exp(-2 n epsilon^2)``: Hoeffding's inequality and a union bound; may exceed 1."""
-    _positive("error", error), _counted("events", events)
+    positive("error", error), counted("events", events)
     if not size >= 0:
         raise ValueError(f"size must not be negative, got {size}")
     return 2 * events * math.exp(-2 * size * error**2)
@@ -70,14 +70,14 @@ def size_for(error: float, delta: float, events: float) -> float:
 
     The dissertation rounds to the nearest integer; the guarantee needs the next one.
     """
-    _positive("error", error), _counted("events", events)
-    return math.log(2 * events / _probability("delta", delta)) / (2 * error**2)
+    positive("error", error), counted("events", events)
+    return math.log(2 * events / probability("delta", delta)) / (2 * error**2)
 
 
 def error_for(size: float, delta: float, events: float) -> float:
     """Error reached with ``size`` trajectories (or samples) for ``delta``; inverse of :func:`size_for`."""
-    _counted("size", size), _counted("events", events)
-    return math.sqrt(math.log(2 * events / _probability("delta", delta)) / (2 * size))
+    counted("size", size), counted("events", events)
+    return math.sqrt(math.log(2 * events / probability("delta", delta)) / (2 * size))
 
 
 def sure_gap(epsilon: float, n_features: int, discount: float, norm: float | None = None) -> float:
@@ -86,7 +86,7 @@ def sure_gap(epsilon: float, n_features: int, discount: float, norm: float | Non
     ``norm`` is ``|theta_E|_1``; without it the ``K`` of weights in [0, 1]. Comes from optimality alone:
     ``LL(theta) - beta |theta|_1`` is largest at the solution.
     """
-    _positive("epsilon", epsilon), _counted("n_features", n_features), _discounted(discount)
+    positive("epsilon", epsilon), counted("n_features", n_features), discounted(discount)
     return (n_features if norm is None else norm) * epsilon / (1 - discount)
 
 
@@ -100,7 +100,7 @@ def me_i2rl_confidence(size: float, epsilon: float, n_features: int, discount: f
     delta)``, ``delta = 2 K exp(-2 n epsilon^2)``. Inverses: :func:`size_for` and :func:`error_for` with ``K``
     events. Raises ``ValueError`` for sizes or errors that are not positive, or a discount outside [0, 1).
     """
-    _discounted(discount)
+    discounted(discount)
     delta = failure_probability(size, epsilon, n_features)
     return Bound(
         "Theorem 1 (Theorem 3 of appendix B)",
@@ -117,8 +117,8 @@ def maximum_entropy_confidence(size: float, error: float, n_features: int, disco
 
     ``LL(theta_E) - LL(theta) <= error`` nats with ``delta = 2 K exp(-n error^2 (1 - gamma)^2 / (2 K^2))``.
     """
-    _positive("error", error), _counted("n_features", n_features)
-    epsilon = error * (1 - _discounted(discount)) / (2 * n_features)
+    positive("error", error), counted("n_features", n_features)
+    epsilon = error * (1 - discounted(discount)) / (2 * n_features)
     bound = me_i2rl_confidence(size, epsilon, n_features, discount)
     return bound._replace(source="Theorem 4 of appendix B (confidence for maximum entropy IRL)")
 
@@ -159,7 +159,7 @@ def lme_i2rl_confidence(
     return Bound(
         "Theorem 2 (Theorem 4 of appendix B)",
         "LL(theta_E) - LL(theta) <= 4 K epsilon_l / (1 - gamma)",
-        2 * n_features * lemma.error / (1 - _discounted(discount)),
+        2 * n_features * lemma.error / (1 - discounted(discount)),
         lemma.confidence,
         lemma.error,
         (*EXPERT, COMPLETION, *PROGRAM_SOLVED),
@@ -195,8 +195,8 @@ def no_regret(
 
     ``session_sizes [T]`` are the trajectories of each session.
     """
-    _positive("c", c), _counted("n_features", n_features), _discounted(discount)
-    sizes = np.cumsum(_session_sizes(session_sizes))
+    positive("c", c), counted("n_features", n_features), discounted(discount)
+    sizes = np.cumsum(counted_sessions(session_sizes))
     i = np.arange(1, len(sizes) + 1)
     epsilon = c * (1 - discount) / i
     delta = 2 * n_features * np.exp(-2 * sizes * epsilon**2)
@@ -220,10 +220,10 @@ def no_regret_sizes(c: float, sessions: int, delta: float, n_features: int, disc
     The failure probability is spent as ``delta_i = 6 delta / (pi i)^2``, so that ``|X_{1:i}| >=
     i^2 log(2 K / delta_i) / (2 c^2 (1 - gamma)^2)``: sessions grow about linearly.
     """
-    _positive("c", c), _counted("sessions", sessions), _counted("n_features", n_features)
+    positive("c", c), counted("sessions", sessions), counted("n_features", n_features)
     i = np.arange(1, sessions + 1)
-    spent = 6 * _probability("delta", delta) / (np.pi * i) ** 2
-    total = np.ceil(np.log(2 * n_features / spent) * (i / (c * (1 - _discounted(discount)))) ** 2 / 2)
+    spent = 6 * probability("delta", delta) / (np.pi * i) ** 2
+    total = np.ceil(np.log(2 * n_features / spent) * (i / (c * (1 - discounted(discount)))) ** 2 / 2)
     return np.diff(total, prepend=0).astype(int)
 
 
@@ -254,7 +254,7 @@ def monotonicity(
     values = np.asarray(log_likelihoods, float)
     if values.ndim != 1 or len(values) < 2:
         raise ValueError(f"monotonicity is about at least two sessions, got shape {values.shape}")
-    sizes = _session_sizes([1] * len(values) if session_sizes is None else session_sizes)
+    sizes = counted_sessions([1] * len(values) if session_sizes is None else session_sizes)
     if len(sizes) != len(values):
         raise ValueError(f"{len(values)} log-likelihoods, but {len(sizes)} session sizes")
     change = np.diff(values)
@@ -314,10 +314,10 @@ def observed_bound(
     ValueError
         For a confidence outside (0, 1), features out of range, or fewer than two trajectories.
     """
-    x = np.asarray(features, float) * (1 - _discounted(discount))
+    x = np.asarray(features, float) * (1 - discounted(discount))
     if x.ndim != 2:
         raise ValueError(f"features must be [n, K], got shape {x.shape}")
-    delta = (1 - _probability("confidence", confidence)) / x.shape[1]
+    delta = (1 - probability("confidence", confidence)) / x.shape[1]
     interval: Interval = (predictable_bernstein if predictable else empirical_bernstein)(x, delta)
     slack = interval.half_width / (1 - discount)
     size = np.ones(x.shape[1]) if weights is None else np.abs(np.asarray(weights, float))
@@ -345,8 +345,8 @@ def observed_size(deviations: Float[np.ndarray, " K"], error: float, confidence:
     spread = np.atleast_1d(np.asarray(deviations, float))
     if spread.ndim != 1 or not ((spread >= 0) & (spread <= 0.5)).all():
         raise ValueError(f"deviations of averages in [0, 1] lie in [0, 0.5], got {spread}")
-    delta = (1 - _probability("confidence", confidence)) / len(spread)
-    _positive("error", error)
+    delta = (1 - probability("confidence", confidence)) / len(spread)
+    positive("error", error)
     values, counts = np.unique(spread, return_counts=True)
     share = counts / len(spread)
     return smallest(lambda n: share @ [predictable_half_width(x, n, delta) for x in values] <= error)
@@ -374,8 +374,8 @@ def demonstrations_needed(
     ``error_nats``. Raises ``ValueError`` for a confidence outside (0, 1), errors that are not positive, or
     deviations that are not ``[K]``.
     """
-    _counted("n_features", n_features), _positive("epsilon_s", epsilon_s), _positive("epsilon", epsilon)
-    delta = (1 - _probability("confidence", confidence)) / 2
+    counted("n_features", n_features), positive("epsilon_s", epsilon_s), positive("epsilon", epsilon)
+    delta = (1 - probability("confidence", confidence)) / 2
     total = epsilon + epsilon_s
     rows: list[tuple[str, int, int]] = [
         (
@@ -394,7 +394,7 @@ def demonstrations_needed(
             raise ValueError(f"{n_features} features, but deviations of shape {np.shape(deviations)}")
         rows.append(("observed spread", observed_size(deviations, total, confidence), 0))
     table = pd.DataFrame(rows, columns=["bound", "trajectories", "draws"]).set_index("bound")
-    table["error_nats"] = 2 * n_features * total / (1 - _discounted(discount))
+    table["error_nats"] = 2 * n_features * total / (1 - discounted(discount))
     return table
 
 
@@ -419,7 +419,7 @@ def table_7_1a(n_features: int = 6, delta: float = 0.1, discount: float = 0.99) 
                 "trajectories": round(size),
                 "sufficient": math.ceil(size),
                 "draws": math.ceil(samples),
-                "error_nats": 2 * n_features * (epsilon + epsilon_s) / (1 - _discounted(discount)),
+                "error_nats": 2 * n_features * (epsilon + epsilon_s) / (1 - discounted(discount)),
             }
         )
     table = pd.DataFrame(rows).set_index("epsilon_l")
@@ -438,7 +438,7 @@ def table_7_1b(n_features: int = 6, epsilon: float = 0.1, delta_s: float = 0.1) 
     table = pd.DataFrame(
         {
             "as_printed": [max(0.0, 1 - d) for d in deltas],
-            "with_delta_s": [max(0.0, 1 - d - _probability("delta_s", delta_s)) for d in deltas],
+            "with_delta_s": [max(0.0, 1 - d - probability("delta_s", delta_s)) for d in deltas],
         },
         index=pd.Index(sizes, name="trajectories"),
     )
@@ -447,28 +447,3 @@ def table_7_1b(n_features: int = 6, epsilon: float = 0.1, delta_s: float = 0.1) 
 
 
 # -- border -------------------------------------------------------------------------------------------
-
-
-def _probability(name: str, x: float) -> float:
-    if not 0 < x < 1:
-        raise ValueError(f"{name} must lie strictly between 0 and 1, got {x}")
-    return x
-
-
-def _counted(name: str, x: float) -> float:
-    if not x >= 1:
-        raise ValueError(f"{name} must be at least 1, got {x}")
-    return x
-
-
-def _discounted(discount: float) -> float:
-    if not 0 <= discount < 1:
-        raise ValueError(f"discount must lie in [0, 1), got {discount}")
-    return discount
-
-
-def _session_sizes(sizes: Int[np.ndarray, " T"] | Sequence[int]) -> np.ndarray:
-    counts = np.asarray(sizes)
-    if counts.ndim != 1 or len(counts) == 0 or not (counts >= 1).all():
-        raise ValueError(f"session sizes must be a list of positive numbers, got {sizes!r}")
-    return counts

@@ -193,6 +193,7 @@ def run_labyrinth(
 ) -> None:
     """Learn a mouse's reward in a labyrinth, bout by bout, each bout predicted before it is learned from."""
     from ...domains.labyrinth.process import read_bouts
+    from ..studies.labyrinth import page as labyrinth_page
     from ..studies.labyrinth import study as labyrinth
 
     with _reported_errors(), _progress(as_json) as advance:
@@ -204,8 +205,8 @@ def run_labyrinth(
             ridge=labyrinth.RIDGE if ridge is None else ridge,
             on_bout=lambda view, number, bits: advance(f"{view}: bout {number}, {bits:.3f} bits", None),
         )  # fmt: skip
-        labyrinth.write(study, report)
-    _tell(labyrinth, study, report, as_json)
+        labyrinth_page.write(study, report)
+    _tell(labyrinth_page, study, report, as_json)
 
 
 # -- bounds -------------------------------------------------------------------------------------------
@@ -588,9 +589,9 @@ def _decision_process(name: str, observability: int | None) -> tuple[TabularMDP,
     if observability is not None:
         raise ValueError("--observability is for the patrols; give an MDP file an in_view array instead")
     if name == "labyrinth":
-        from ...domains.labyrinth.process import labyrinth
+        from ...domains.labyrinth.process import mouse_labyrinth
 
-        return labyrinth().mdp, Sensor()
+        return mouse_labyrinth().mdp, Sensor()
     if not name.endswith(".npz"):
         raise ValueError(f"--mdp is patrol1, patrol2, patrol3, labyrinth or an .npz file, got {name!r}")
     from ...models.observation.storage import load_mdp

@@ -16,8 +16,8 @@ from jaxtyping import Array
 
 from ...inference.journal.journal import Journal, JournalError, Position
 from ...inference.journal.locking import Identity
+from ...inference.sessions.learner import Learner, Report
 from ...inference.sessions.serialization import demonstration_digest
-from ...inference.sessions.session import Learner, Report
 from ...models.observation.demonstration import (
     DEFAULT_LIMITS,
     DemonstrationError,

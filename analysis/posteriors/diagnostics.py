@@ -24,11 +24,11 @@ from ...inference.posteriors.chains import in_threads
 from ...inference.posteriors.weights import (
     Chain,
     Problem,
-    _described,
-    _fingerprint,
-    _run_chain,
+    described_prior,
+    fingerprint,
     gather,
     posterior_mode,
+    run_nuts_chain,
 )
 from ...models.inputs.arguments import as_key
 from ...models.observation.demonstration import PAD, UNKNOWN, Demonstration
@@ -102,7 +102,7 @@ def require_posterior(
                 f"but the MDP has {_listed(mdp.feature_names)}"
             )
     if sensor is not None:
-        mine = _fingerprint(sensor)
+        mine = fingerprint(sensor)
         theirs = attrs.get("sensor_fingerprint", mine)
         if mine != theirs:
             raise InferenceDataError(
@@ -203,7 +203,7 @@ def posterior_by_session(
     problem, rows = gather(mdp, sensor, demonstration, prior)
     require_possible(sensor, mdp, demonstration)
     run = partial(
-        _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
+        run_nuts_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
     )
     jobs = []
     for number in numbers:
@@ -228,8 +228,8 @@ def posterior_by_session(
         "inference_library": "numpyro",
         "inference_library_version": version("numpyro"),
         "sensor": type(sensor).__name__,
-        "sensor_fingerprint": _fingerprint(sensor),
-        "prior": _described(problem.prior),
+        "sensor_fingerprint": fingerprint(sensor),
+        "prior": described_prior(problem.prior),
     }
     n_steps = stacked.transitions.n_steps
     statistics = {

@@ -20,7 +20,8 @@ import xarray as xr
 from jax import lax
 from jaxtyping import Array, Float
 
-from ...inference.sessions.session import Learner, Report, Run
+from ...inference.sessions.learner import Learner, Report
+from ...inference.sessions.running import Run
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import reward_of, soft_plan
 from ...version import __version__
@@ -72,7 +73,7 @@ def run_history(
     ----------
     learner : Learner
     run : Run or sequence of Report
-        What :func:`~i2rl.inference.sessions.session.run_sessions` returned, or the reports alone.
+        What :func:`~i2rl.inference.sessions.running.run_sessions` returned, or the reports alone.
     statistic : NamedTuple of arrays, optional
         The sufficient statistic at the end; taken from the run's state where there is one.
     seed : int, optional
@@ -85,7 +86,7 @@ def run_history(
     arviz.InferenceData
         ``sessions``: ``weights (session, feature)``; ``log_likelihood``, ``demonstration_log_likelihood``,
         ``gradient``, ``iterations``, ``solver_iterations`` and ``seconds (session)``, see
-        :class:`~i2rl.inference.sessions.session.Report`. Reports with further fields give further variables.
+        :class:`~i2rl.inference.sessions.learner.Report`. Reports with further fields give further variables.
         ``learned``, what the learner ended with: ``soft_policy (state, action)``, ``weights (feature)`` and
         the statistic's fields (``counts (state, action)`` or ``features (feature)`` and ``start (state)``,
         and ``size``).
@@ -113,7 +114,7 @@ def fleet_history(
 ) -> az.InferenceData:
     """The sessions of a fleet: as :func:`run_history`, with a leading dimension ``run``, one entry a stream.
 
-    ``reports`` are those of consecutive updates of :func:`~i2rl.inference.sessions.session.fleet`, ``state``
+    ``reports`` are those of consecutive updates of :func:`~i2rl.inference.sessions.fleets.fleet`, ``state``
     is the fleet's last state. Raises ``ValueError`` as there, and for reports of a single learner.
     """
     reports = _reports(reports)

@@ -114,7 +114,7 @@ class Labyrinth(NamedTuple):
 
 
 @cache
-def labyrinth(discount: float = 0.9) -> Labyrinth:
+def mouse_labyrinth(discount: float = 0.9) -> Labyrinth:
     """Build the labyrinth. Raises ``ValueError`` for a discount outside (0, 1]."""
     return _build(discount, (*SHARED_FEATURES, *_NODE_FEATURES), _features)
 

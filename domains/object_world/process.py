@@ -61,7 +61,7 @@ class ObjectWorld(NamedTuple):
         return self.cells.index(cell)
 
 
-def object_world(
+def random_object_world(
     key: Array,
     size: int = 10,
     walls: int = 25,

@@ -23,7 +23,7 @@ from ...models.laws.chain import condition
 from ...models.observation.demonstration import HIDDEN, LOST
 from ...models.observation.evidence import Imperfection, step_log_evidence
 from ...models.process.mdp import TabularMDP
-from .process import Breach, Interaction, Patrol, _ahead, _simulate
+from .process import Breach, Interaction, Patrol, cell_ahead, simulate_patrollers
 
 MOVES = ("forward", "left", "right")
 
@@ -99,7 +99,7 @@ def breach_task(patrol: Patrol, reach: float = 3.0) -> BreachTask:
     states = [breach.start._replace(row=r, column=c, heading=h) for r, c in breach.cells for h in range(4)]
     following = []
     for state in states:
-        cell = _ahead(state) if _ahead(state) in index else state.cell
+        cell = cell_ahead(state) if cell_ahead(state) in index else state.cell
         turns = ((state.heading + 1) % 4, (state.heading - 1) % 4)
         at = index[state.cell] * 4
         following.append((index[cell] * 4 + state.heading, at + turns[0], at + turns[1]))
@@ -227,7 +227,7 @@ class SimulatedForecast(NamedTuple):
         def one(key: Array) -> Int[Array, "P T"]:
             begin, walk = jax.random.split(key)
             start = jax.random.categorical(begin, jnp.log(beliefs))
-            return _simulate(walk, mdp, cells, log_policies, start, equilibrium, length, horizon)[0]
+            return simulate_patrollers(walk, mdp, cells, log_policies, start, equilibrium, length, horizon)[0]
 
         states = jax.vmap(one)(jax.random.split(key, self.draws))
         patroller, time = np.ogrid[: beliefs.shape[0], :horizon]

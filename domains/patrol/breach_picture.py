@@ -8,7 +8,8 @@ import numpy as np
 from jaxtyping import Bool, Int, UInt8
 from matplotlib.patches import Rectangle
 
-from ..gym.pictures import AGENT, GOAL, WATER, Backdrop, Walker, draw_floor, outline
+from ..gym.canvas import AGENT, GOAL, WATER, Backdrop
+from .picture import Walker, draw_floor, outline
 from .process import Patrol, State
 
 SEEN = "#f7c9a6"

@@ -14,7 +14,7 @@ import numpy as np
 from gymnasium.spaces import Discrete, MultiDiscrete
 from jaxtyping import Int, UInt8
 
-from ..environments import _drawn
+from ..gym.tabular import drawn
 from .breach import MOVES, BreachSettings, breach_task
 from .process import FORWARD, HEADINGS, STOP, Interaction, Patrol, State
 from .trials import CAUGHT, OUTCOMES, REACHED
@@ -109,7 +109,7 @@ class BreachEnv(gymnasium.Env[np.ndarray, int]):
         if given:
             raise ValueError(f"reset knows the option 'patrollers' only, got {', '.join(map(repr, given))}")
         self._patrollers = (
-            np.array([_drawn(self._initial, self.np_random.random()) for _ in range(self.patrol.patrollers)])
+            np.array([drawn(self._initial, self.np_random.random()) for _ in range(self.patrol.patrollers)])
             if patrollers is None
             else self._states_given(patrollers)
         )
@@ -178,7 +178,7 @@ class BreachEnv(gymnasium.Env[np.ndarray, int]):
             side = np.array(self.interaction.equilibrium)[: len(states)]
             actions = np.where(side == FORWARD, actions, side)
         branches = [
-            _drawn(self._cumulative[s, a], self.np_random.random())
+            drawn(self._cumulative[s, a], self.np_random.random())
             for s, a in zip(states, actions, strict=True)
         ]
         self._patrollers = self._successors[states, actions, branches]

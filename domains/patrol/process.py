@@ -152,14 +152,14 @@ def simulate_patrol(
     is recorded as stopping.
     """
     cells = jnp.asarray(patrol.cell_of_state)
-    return _simulate(
+    return simulate_patrollers(
         key, patrol.mdp, cells, jnp.asarray(log_policies), jnp.asarray(start), interaction.equilibrium,
         interaction.length, steps,
     )  # fmt: skip
 
 
 @partial(jax.jit, static_argnums=(5, 6, 7))
-def _simulate(
+def simulate_patrollers(
     key: Array,
     mdp: TabularMDP,
     cells: Int[Array, " S"],
@@ -169,6 +169,7 @@ def _simulate(
     length: int,
     steps: int,
 ) -> tuple[Int[Array, "P T"], Int[Array, "P T"]]:
+    """Let patrollers walk under their policies; return their states and actions."""
     patrollers = log_policies.shape[0]
     side = jnp.asarray(equilibrium[:patrollers] if patrollers > 1 else (FORWARD,))
 
@@ -268,7 +269,8 @@ def _build(
     return Patrol(name, mdp, np.array(weights), states, patrollers, masks, breach, loop, observability)
 
 
-def _ahead(state: State) -> Cell:
+def cell_ahead(state: State) -> Cell:
+    """Return the cell that a patroller faces."""
     down, across = _STEP[state.heading]
     return state.row + down, state.column + across
 
@@ -279,8 +281,8 @@ def _walk(cells: frozenset[Cell]) -> Callable[[State, int], State]:
             return state._replace(heading=(state.heading + 1) % 4)
         if action == RIGHT:
             return state._replace(heading=(state.heading - 1) % 4)
-        if action == FORWARD and _ahead(state) in cells:
-            row, column = _ahead(state)
+        if action == FORWARD and cell_ahead(state) in cells:
+            row, column = cell_ahead(state)
             return state._replace(row=row, column=column)
         return state
 
@@ -316,7 +318,7 @@ def four_hallways() -> Patrol:
 
     def intend(state: State, action: int) -> State:
         target = state.phase % 4 + 1
-        if action == FORWARD and _ahead(state) == ends[target]:
+        if action == FORWARD and cell_ahead(state) == ends[target]:
             return State(*ends[target], state.heading, target)
         return _walk(legal[state.phase])(state, action)
 

@@ -32,7 +32,7 @@ from .breach import (
     plan_breach,
     watch,
 )
-from .process import SECONDS_PER_STEP, Interaction, Patrol, _simulate, greedy_policy
+from .process import SECONDS_PER_STEP, Interaction, Patrol, greedy_policy, simulate_patrollers
 
 REACHED, CAUGHT, TIMED_OUT, RAN_OUT = range(4)
 OUTCOMES = ("reached", "caught", "timed out", "ran out")
@@ -238,7 +238,7 @@ def _trials(
     def trial(key: Array, ready: Int[Array, ""]) -> tuple:
         first, patrol_key, look, go_key, predict_key, walk_key = jax.random.split(key, 6)
         start = jax.random.categorical(first, jnp.log(mdp.initial), shape=patrollers.shape)
-        states, actions = _simulate(
+        states, actions = simulate_patrollers(
             patrol_key, mdp, cells, true_policies, start, equilibrium, meeting, length
         )
         codes = jax.vmap(lambda p: observe(jax.random.fold_in(look, p), view, states[p], actions[p]))(

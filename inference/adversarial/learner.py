@@ -26,7 +26,7 @@ from ...models.inputs.arguments import as_key
 from ...models.inputs.extras import required
 from ...models.networks.modules import DTYPE, ActionSpace, Policy, ShapedReward
 from ...models.observation.recordings import Recording, require_recording
-from ..sessions.session import Learner
+from ..sessions.learner import Learner
 from .discriminator import (
     AVERAGES,
     Discriminator,

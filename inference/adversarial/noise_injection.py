@@ -31,7 +31,7 @@ from ...models.inputs.extras import required
 from ...models.networks.environment import Environment, HostEnvironment, Rollout
 from ...models.networks.modules import DTYPE, MLP, ActionSpace, Policy, ShapedReward
 from ...models.observation.recordings import Recording
-from ..sessions.session import Learner
+from ..sessions.learner import Learner
 from .discriminator import Discriminator, Losses, Transitions, cross_entropy
 from .learner import (
     AdversarialReport,

@@ -33,7 +33,7 @@ from ...models.observation.recordings import (
 )
 from ..completion.gaussian import GaussianTruth, fitted_sensor
 from ..completion.partitioned import CandidateTruth, fitted_shift_sensor
-from ..sessions.session import Learner
+from ..sessions.learner import Learner
 from .discriminator import Discriminator, ExpertTransitions, Transitions, airl_discriminator
 from .learner import AdversarialTraining, adversarial
 

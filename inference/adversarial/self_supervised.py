@@ -24,7 +24,7 @@ from ...models.inputs.arguments import as_key
 from ...models.networks.environment import Environment, HostEnvironment, Rollout
 from ...models.networks.modules import DTYPE, ShapedReward
 from ...models.observation.recordings import Recording
-from ..sessions.session import Learner
+from ..sessions.learner import Learner
 from .discriminator import Discriminator
 from .learner import AdversarialReport, AdversarialState, action_log_likelihood
 from .noise_injection import NoisyRollout, NoisyTraining, noisy_airl, roll_out_noisily

@@ -172,7 +172,7 @@ def draw_snippets(key: Array, ranked: Ranked, lengths: Int[np.ndarray, " m"]) ->
     return Snippets(which, start, length, (WORTH * ranked.worth[which] * share).astype(DTYPE))
 
 
-class _Packing(NamedTuple):
+class Packing(NamedTuple):
     """Where the states of a batch of snippets lie in one array ``[N]`` without gaps; each slot's room."""
 
     slot: Int[np.ndarray, " N"]
@@ -180,9 +180,10 @@ class _Packing(NamedTuple):
     room: Int[np.ndarray, " B"]
 
     @staticmethod
-    def of(room: Int[np.ndarray, " B"]) -> _Packing:
+    def of(room: Int[np.ndarray, " B"]) -> Packing:
+        """Pack batches of the sizes given."""
         slot = np.repeat(np.arange(len(room)), room)
-        return _Packing(slot, np.concatenate([np.arange(r) for r in room]), room)
+        return Packing(slot, np.concatenate([np.arange(r) for r in room]), room)
 
     def predicted(
         self,
@@ -219,11 +220,11 @@ def snippet_regression(settings: Regression) -> tuple[Callable[[SSRRReward], Any
     kept = snippet_lengths(settings, settings.kept)
     held = snippet_lengths(settings, settings.snippets - settings.kept)
     stratum = settings.kept // settings.batch
-    packing = _Packing.of(np.minimum(kept[stratum - 1 :: stratum][: settings.batch], settings.points))
+    packing = Packing.of(np.minimum(kept[stratum - 1 :: stratum][: settings.batch], settings.points))
     # The snippets held out are judged in batches as well, the last of which repeats some.
     rows = np.minimum(np.arange(-(-len(held) // settings.batch) * settings.batch), len(held) - 1)
     judging = rows.reshape(-1, settings.batch)
-    wide = _Packing.of(np.full(settings.batch, min(settings.longest, settings.points)))
+    wide = Packing.of(np.full(settings.batch, min(settings.longest, settings.points)))
 
     def init(reward: SSRRReward) -> Any:
         return jax.vmap(optimiser.init)(reward.members)

@@ -242,13 +242,14 @@ def _smooth(filtered: GaussianFiltered) -> GaussianSmoothed:
 
 
 @partial(jax.jit, static_argnums=2)
-def _draw(key: Array, filtered: GaussianFiltered, draws: int) -> Float[Array, "M n L D"]:
+def draw_gaussian(key: Array, filtered: GaussianFiltered, draws: int) -> Float[Array, "M n L D"]:
+    """Draw trajectories from filtered Gaussian chains."""
     keys = jax.random.split(key, filtered.means.shape[0])
     return lax.map(lambda x: sample_filtered(x[0], x[1], draws), (keys, filtered)).swapaxes(0, 1)
 
 
 @jax.jit
-def _log_density(
+def log_density(
     filtered: GaussianFiltered, reported: Recording, pairs: Float[Array, "M n L D"]
 ) -> Float[Array, "M n"]:
     """Log-density of truths under the linearised posterior."""
@@ -364,7 +365,8 @@ class GaussianTruth(NamedTuple):
         Raises ``ValueError`` for fewer than one pass (:meth:`resample` draws without).
         """
         chain, filtered = self.smooth(chain, policy, sensor, passes)
-        return chain, _bounded_truths(self.bounds, chain.reported, _draw(as_key(key), filtered, self.draws))
+        draws = draw_gaussian(as_key(key), filtered, self.draws)
+        return chain, _bounded_truths(self.bounds, chain.reported, draws)
 
     def smooth(
         self, chain: TruthChain, policy: Any, sensor: GaussianSensor, passes: int = 1
@@ -384,7 +386,7 @@ class GaussianTruth(NamedTuple):
     def resample(self, chain: TruthChain, policy: Any, key: Array, sensor: GaussianSensor) -> Truths:
         """Draws with the dynamics as last linearised; one :meth:`refresh` must have gone before."""
         filtered = _filter(self.model, self.bounds, policy, self._sized(sensor, chain), chain)
-        return _bounded_truths(self.bounds, chain.reported, _draw(as_key(key), filtered, self.draws))
+        return _bounded_truths(self.bounds, chain.reported, draw_gaussian(as_key(key), filtered, self.draws))
 
     def posterior(self, chain: TruthChain, policy: Any, sensor: GaussianSensor) -> GaussianSmoothed:
         """Moments of the pairs ``(s, a)``, with the dynamics as last linearised, and the log-likelihood."""

@@ -33,8 +33,8 @@ from .gaussian import (
     JaxDynamics,
     Model,
     TruthChain,
-    _draw,
-    _log_density,
+    draw_gaussian,
+    log_density,
     log_joint,
     policy_moments,
 )
@@ -291,7 +291,7 @@ class GaussianGibbs(NamedTuple):
         chain = chain._replace(smoothed=smoothed)
         if first:
             key, begin = jax.random.split(key)
-            chain = _dispersed(chain, _draw(begin, filtered, t.draws))
+            chain = _dispersed(chain, draw_gaussian(begin, filtered, t.draws))
         before = chain
         sweep = _compiled_sweep if isinstance(t.dynamics, JaxDynamics) else _sweep
         for key_sweep in jax.random.split(key, self.sweeps):
@@ -350,7 +350,7 @@ def _move_whole(
     log_ratio = _log_exact_to_smoothed(truth, policy, sensor, filtered, chain)
     for stride, k in zip(STRIDES, jax.random.split(key, len(STRIDES)), strict=True):
         key_draw, key_accept = jax.random.split(k)
-        candidate = _stridden(chain, _draw(key_draw, filtered, truth.draws), stride)
+        candidate = _stridden(chain, draw_gaussian(key_draw, filtered, truth.draws), stride)
         log_candidate = _log_exact_to_smoothed(truth, policy, sensor, filtered, candidate)
         chain, log_ratio = _chosen(key_accept, chain, candidate, log_ratio, log_candidate)
     return chain
@@ -384,7 +384,7 @@ def _log_exact_to_smoothed(
     s, a = chain.observations, chain.actions
     flat = _next(truth.dynamics, s.reshape(-1, s.shape[-1]), a.reshape(-1, a.shape[-1]))
     exact = log_joint(truth.model, policy, sensor, chain.reported, s, a, flat.reshape(s.shape))
-    return exact - _log_density(filtered, chain.reported, _pairs(chain))
+    return exact - log_density(filtered, chain.reported, _pairs(chain))
 
 
 def _sweep(

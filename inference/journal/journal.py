@@ -57,7 +57,7 @@ from .locking import (
 if TYPE_CHECKING:
     import arviz
 
-    from ..sessions.session import Learner
+    from ..sessions.learner import Learner
 
 __all__ = ["Journal", "JournalBusy", "JournalError", "JournalView", "Origin", "Position", "SessionRecord"]
 

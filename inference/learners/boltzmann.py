@@ -16,7 +16,7 @@ from jaxtyping import Array, Float
 
 from ...models.observation.demonstration import HIDDEN, LOST, PAD, UNKNOWN, Demonstration, DemonstrationError
 from ...models.observation.evidence import checked_demonstration
-from ...models.process.mdp import TabularMDP, _PairNames
+from ...models.process.mdp import PairNames, TabularMDP
 from ...models.process.planning import action_values, hard_plan, policy_values, reward_of
 
 # Inverse temperature of the published baselines.
@@ -85,7 +85,7 @@ def require_available_visits(mdp: TabularMDP, counts: Float[Array, "n S A"]) -> 
     if len(wrong):
         i, s, a = wrong[0]
         raise DemonstrationError(
-            f"trajectory {i} visits {_PairNames(mdp.labels).pair(s, a)}, which is not available there"
+            f"trajectory {i} visits {PairNames(mdp.labels).pair(s, a)}, which is not available there"
         )
 
 
@@ -101,7 +101,7 @@ def visit_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.ndar
     if not live.any():
         raise DemonstrationError("the demonstration has no step; this method needs at least one trajectory")
     seen = live & ~np.isin(kind, (HIDDEN, LOST)) & (state != UNKNOWN) & (action != UNKNOWN)
-    names = _PairNames(mdp.labels)
+    names = PairNames(mdp.labels)
     if (live & ~seen).any():
         i, t = np.argwhere(live & ~seen)[0]
         why = {HIDDEN: "is hidden", LOST: "is a lost frame"}.get(int(kind[i, t]), "was seen only in part")

@@ -39,8 +39,8 @@ from ...models.observation.evidence import Sensor, checked_demonstration, requir
 from ...models.process.mdp import Labels, TabularMDP
 from ...models.process.planning import features_to_go, require_discounted, reward_of, soft_plan
 from ..completion.smoothing import Evidence, evidence_of, smooth_all
+from ..sessions.learner import Learner, Report
 from ..sessions.scaling import on_scaled_features
-from ..sessions.session import Learner, Report
 from ..sessions.statistic import FEATURES, FeatureStatistic, complete
 
 

@@ -35,7 +35,7 @@ from ..completion.smoothing import Evidence, smooth_all
 from ..programs.observation import Identification, unidentified_predicates
 from ..sensors.observations import report_classes, report_log_evidence
 from ..sensors.reliabilities import Perception, PreparedSession, entropic_perception, prepare
-from .noisy import DEFAULT_START, _first_logits
+from .noisy import DEFAULT_START, initial_logits
 
 # How often the decided expert still errs, so that nothing is ruled out.
 _ERRS = 1e-3
@@ -142,7 +142,7 @@ def sensor_identifier(
     mask = None if reportable is None else np.asarray(reportable, bool)
     classes = report_classes(psi, mask)
     perception = entropic_perception(classes, scores, "posterior", errors, 1.0)
-    fit = _fit(mdp, perception, seen.presence, _first_logits(psi, DEFAULT_START))
+    fit = _fit(mdp, perception, seen.presence, initial_logits(psi, DEFAULT_START))
     slips = mdp.available / mdp.available.sum(1, keepdims=True)
 
     def identify(demonstration: Demonstration, weights: ArrayLike) -> SensorIdentification:

@@ -37,8 +37,8 @@ from ...models.process.planning import (
     require_discounted,
     reward_of,
 )
+from ..sessions.learner import Learner, Report
 from ..sessions.scaling import on_scaled_features
-from ..sessions.session import Learner, Report
 
 
 class JinState(NamedTuple):

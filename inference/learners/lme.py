@@ -7,7 +7,6 @@ exponentiated gradient, which can express neither negative weights nor a sharper
 
 from __future__ import annotations
 
-import hashlib
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -20,7 +19,6 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ...models.inputs.arguments import as_key
-from ...models.laws.chain import Smoothed
 from ...models.observation.demonstration import SEEN as SEEN_STEP
 from ...models.observation.demonstration import Demonstration, DemonstrationError
 from ...models.observation.evidence import (
@@ -31,21 +29,25 @@ from ...models.observation.evidence import (
     require_possible,
 )
 from ...models.process.mdp import TabularMDP
-from ...models.process.planning import SoftPlan, require_discounted, reward_of, soft_plan
+from ...models.process.planning import require_discounted
 from ...models.process.units import feature_scale, with_scaled_features
-from ..completion.smoothing import Evidence, blocked_posterior, evidence_of, gibbs_posterior, smooth_all
-from ..programs.constraints import FeatureTarget
+from ..completion.smoothing import Evidence, evidence_of
 from ..programs.maximum_entropy import (
     Solution,
     WarmStart,
-    exponentiate_scaled,
-    fit_scaled_counts,
-    solve_scaled_dual,
 )
+from ..sessions.learner import Learner, Report, digest_of
 from ..sessions.scaling import on_scaled_features
-from ..sessions.schedule import Schedule, described, program_slack, require_slack, require_slack_in
-from ..sessions.session import Learner, Report
-from ..sessions.statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
+from ..sessions.schedule import Schedule, described, require_slack_in
+from ..sessions.statistic import blend
+from .alternation import (
+    Method,
+    checked_method,
+    exponentiated,
+    newton,
+    random_weights,
+    relative_change,
+)
 
 # Nats per trajectory and unit of scaled weight. Smaller lets nearly deterministic experts be nearly so.
 DEFAULT_SLACK = 0.002
@@ -90,46 +92,6 @@ class _Iterate(NamedTuple):
     solver_iterations: Int[Array, ""]
     converged: Bool[Array, ""]
     key: Array
-
-
-class _Method(NamedTuple):
-    """What the parts of a session need to know."""
-
-    mdp: TabularMDP
-    sensor: Imperfection
-    statistic: Statistic
-    completion: Callable[[Array, TabularMDP, Float[Array, "S A"], Evidence], Smoothed]
-    slack: Schedule
-    ridge: float
-
-    def plan(self, weights: Float[Array, " K"], values: Float[Array, " S"]) -> SoftPlan:
-        return soft_plan(self.mdp, reward_of(self.mdp, weights), values)
-
-    def e_step(self, key: Array, plan: SoftPlan, evidence: Evidence, seen: Bool[Array, "n L"]) -> Any:
-        posterior = self.completion(key, self.mdp, plan.log_policy, evidence)
-        return complete(self.mdp, posterior, evidence.live, seen)
-
-    def working(self, kept: Any, key: Array, plan: SoftPlan, evidence: Evidence, seen: Array) -> tuple:
-        """What the M-step fits, and the session's exact log-likelihood under ``plan``.
-
-        It fits the carried statistic and the current session, completed under ``plan``.
-        """
-        completed = self.e_step(key, plan, evidence, seen)
-        working = blend(kept, self.statistic.of_session(self.mdp, plan, completed))
-        return working, jnp.sum(completed.expectations.log_likelihood)
-
-    def gradient(self, weights: Float[Array, " K"], values: Float[Array, " S"], working: Any) -> Array:
-        """Norm of the log-likelihood's gradient; ``|phi_hat - E[phi]|`` with the ``features`` statistic."""
-
-        def likelihood(w: Float[Array, " K"]) -> Float[Array, ""]:
-            return self.statistic.log_likelihood(self.mdp, w, self.plan(w, values).values, working)
-
-        return jnp.linalg.norm(jax.grad(likelihood)(weights))
-
-    def penalties(self, statistic: Any, session: Int[Array, ""]) -> tuple:
-        """Slack of the program in a session, and the prior's precision per trajectory."""
-        slack = program_slack(self.slack, session, self.statistic.slack(self.mdp, 1.0))
-        return slack, self.ridge / jnp.maximum(statistic.size, 1.0)
 
 
 def lme_i2rl(
@@ -191,12 +153,12 @@ def lme_i2rl(
     sensor = fitting_sensor(sensor, mdp)
 
     def build(mdp: TabularMDP) -> Learner:
-        method = _method(mdp, sensor, statistic, completion, slack, ridge, draws)
+        method = checked_method(mdp, sensor, statistic, completion, slack, ridge, draws)
         configuration = {
             "statistic": statistic, "completion": completion, "solver": solver, "slack": described(slack),
             "ridge": ridge,
             "draws": draws if completion != "exact" else 0, "iterations": iterations, "tolerance": tolerance,
-            "sensor": _digest(sensor),
+            "sensor": digest_of(sensor),
         }  # fmt: skip
         start = partial(_carried_on, method)
         return _learner(name, method, start, solver, iterations, tolerance, configuration)
@@ -214,7 +176,7 @@ def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: Imperfection, **option
     configuration = carried.configuration
 
     def build(mdp: TabularMDP) -> Learner:
-        method = _method(
+        method = checked_method(
             mdp, sensor, configuration["statistic"], configuration["completion"],
             options.get("slack", DEFAULT_SLACK), configuration["ridge"], configuration["draws"],
         )  # fmt: skip
@@ -238,71 +200,17 @@ def me_i2rl(mdp: TabularMDP, **options: Any) -> Learner:
 # -- building blocks ----------------------------------------------------------------------------------
 
 
-def _method(
-    mdp: TabularMDP,
-    sensor: Imperfection,
-    statistic: str,
-    completion: str,
-    slack: Schedule,
-    ridge: float,
-    draws: int,
-) -> _Method:
-    samplers = {"blocked": blocked_posterior, "gibbs": gibbs_posterior}
-    if statistic not in STATISTICS:
-        raise ValueError(f"statistic must be one of {', '.join(STATISTICS)}, got {statistic!r}")
-    if completion != "exact" and completion not in samplers:
-        raise ValueError(f"completion must be exact, blocked or gibbs, got {completion!r}")
-    if completion != "exact" and draws < 1:
-        raise ValueError(f"a sampled completion needs at least one draw, got {draws}")
-    require_slack(slack)
-    if not ridge >= 0:
-        raise ValueError(f"ridge must not be negative, got {ridge}")
-
-    def exact(key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Smoothed:
-        del key
-        return smooth_all(mdp, log_policy, evidence)
-
-    complete_with = exact if completion == "exact" else partial(samplers[completion], draws=draws)
-    return _Method(mdp, sensor, STATISTICS[statistic], complete_with, slack, ridge)
-
-
-def _digest(sensor: Imperfection) -> str:
-    """Identifies a sensor in a configuration."""
-    digest = hashlib.sha256(type(sensor).__name__.encode())
-    for leaf in jax.tree.leaves(sensor):
-        digest.update(np.ascontiguousarray(leaf).tobytes())
-    return digest.hexdigest()[:16]
-
-
-def _random_weights(key: Array, mdp: TabularMDP) -> Float[Array, " K"]:
-    """``theta^0_k ~ uniform(0, 1)``, scaled (Algorithm 1, line 2)."""
-    return jax.random.uniform(key, (mdp.n_features,), float)
-
-
-def _carried_on(method: _Method, key: Array, state: LMEState) -> tuple:
+def _carried_on(method: Method, key: Array, state: LMEState) -> tuple:
     del key
     return state.weights, state.values
 
 
-def _started_afresh(method: _Method, key: Array, state: LMEState) -> tuple:
-    return _random_weights(key, method.mdp), jnp.zeros_like(state.values)
-
-
-def _newton(mdp: TabularMDP, statistic: Any, slack: Array, ridge: Array, start: WarmStart) -> Solution:
-    if isinstance(statistic, FeatureStatistic):
-        target = FeatureTarget(statistic.features, statistic.start)
-        return solve_scaled_dual(mdp, target, slack, ridge, start)
-    return fit_scaled_counts(mdp, statistic.counts, slack, ridge, start)
-
-
-def _exponentiated(mdp: TabularMDP, statistic: Any, slack: Array, ridge: Array, start: WarmStart) -> Solution:
-    del ridge  # the printed update has no prior
-    target = FeatureTarget(statistic.features, statistic.start)
-    return exponentiate_scaled(mdp, target, slack * (1 - mdp.discount), start=start.weights)
+def _started_afresh(method: Method, key: Array, state: LMEState) -> tuple:
+    return random_weights(key, method.mdp), jnp.zeros_like(state.values)
 
 
 def _em(
-    method: _Method,
+    method: Method,
     m_step: Callable[..., Solution],
     iterations: int,
     tolerance: float,
@@ -329,7 +237,7 @@ def _em(
             lambda: point.gradient,
         )
         return _Iterate(
-            solution.weights, solution.values, _change(point.weights, solution.weights), gradient,
+            solution.weights, solution.values, relative_change(point.weights, solution.weights), gradient,
             point.iterations + 1, point.solver_iterations + solution.iterations, solution.converged, key,
         )  # fmt: skip
 
@@ -342,12 +250,8 @@ def _em(
     return lax.while_loop(unfinished, step, first)
 
 
-def _change(old: Float[Array, " K"], new: Float[Array, " K"]) -> Float[Array, ""]:
-    return jnp.max(jnp.abs(new - old)) / (1e-3 + jnp.max(jnp.abs(new)))
-
-
 def _close(
-    method: _Method,
+    method: Method,
     state: LMEState,
     point: _Iterate,
     program: Any,
@@ -382,7 +286,7 @@ def _close(
 
 def _learner(
     name: str,
-    method: _Method,
+    method: Method,
     start: Callable[[Array, LMEState], tuple],
     solver: str,
     iterations: int,
@@ -390,7 +294,7 @@ def _learner(
     configuration: Mapping[str, Any],
 ) -> Learner:
     mdp = method.mdp
-    in_jax = {"newton": _newton, "exponentiated gradient": _exponentiated}
+    in_jax = {"newton": newton, "exponentiated gradient": exponentiated}
     if solver not in (*in_jax, "ipopt", "cvxpy"):
         raise ValueError(f"solver must be newton, ipopt, cvxpy or exponentiated gradient, got {solver!r}")
     if solver in ("cvxpy", "exponentiated gradient"):
@@ -458,7 +362,7 @@ def _learner(
                     break
                 first = gradient if steps == 0 else first
                 solution, program = solve(working, slack, ridge, program)
-                change = float(_change(weights, jnp.asarray(solution.weights)))
+                change = float(relative_change(weights, jnp.asarray(solution.weights)))
                 weights, values = jnp.asarray(solution.weights), jnp.asarray(solution.values)
                 total, steps = total + int(solution.iterations), steps + 1
                 converged = solution.converged
@@ -474,7 +378,7 @@ def _learner(
 
     def init(key: Array) -> LMEState:
         key, fresh = jax.random.split(as_key(key))
-        weights = _random_weights(fresh, mdp)
+        weights = random_weights(fresh, mdp)
         return LMEState(
             weights,
             method.statistic.empty(mdp),
@@ -564,7 +468,7 @@ def batch_lme(
     sensor = fitting_sensor(sensor, mdp)
     given, mdp = mdp, with_scaled_features(mdp)
     scale = np.asarray(feature_scale(given))
-    method = _method(mdp, sensor, "counts", "exact", slack, ridge, 0)
+    method = checked_method(mdp, sensor, "counts", "exact", slack, ridge, 0)
 
     @jax.jit
     def fit(key: Array, demonstration: Demonstration) -> tuple:
@@ -573,10 +477,10 @@ def batch_lme(
         kept = method.statistic.empty(mdp)
 
         def from_start(key: Array) -> tuple:
-            weights = _random_weights(key, mdp)
+            weights = random_weights(key, mdp)
             point = _em(
                 method,
-                _newton,
+                newton,
                 iterations,
                 tolerance,
                 jnp.ones((), int),

@@ -44,9 +44,8 @@ from ..mixtures.fit import (
     nothing_kept,
 )
 from ..mixtures.search import Search, search
+from ..sessions.learner import Learner, digest_of, in_plain_numbers
 from ..sessions.scaling import on_scaled_features
-from ..sessions.session import Learner, in_plain_numbers
-from .lme import _digest
 
 DEFAULT_WAYS = 4
 DEFAULT_RESTARTS = 4
@@ -190,7 +189,8 @@ def mme_mtirl(
         program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
         configuration = {
             "ways": ways, "strength": strength, "price": price, "l1": l1, "ridge": ridge,
-            "restarts": restarts, "iterations": iterations, "tolerance": tolerance, "sensor": _digest(sensor),
+            "restarts": restarts, "iterations": iterations, "tolerance": tolerance,
+            "sensor": digest_of(sensor),
         }  # fmt: skip
         return _learner(program, sensor, ways, restarts, configuration)
 

@@ -50,11 +50,12 @@ from ..sensors.reliabilities import (
     prepare,
     printed_perception,
 )
+from ..sessions.learner import Learner, digest_of, in_plain_numbers
 from ..sessions.scaling import on_scaled_features
 from ..sessions.schedule import Schedule, described, require_slack, require_slack_in
-from ..sessions.session import Learner, in_plain_numbers
 from ..sessions.statistic import blend, complete
-from .lme import Batch, _change, _digest, _Method, _method, _newton, _random_weights, batch_lme
+from .alternation import Method, checked_method, newton, random_weights, relative_change
+from .lme import Batch, batch_lme
 
 Scores = Literal["stepwise", "averaged", "none"]
 Truths = Literal["posterior", "observed", "oracle", "all"]
@@ -230,13 +231,13 @@ def rimeo(
         "scores": scores, "truths": truths, "unscored": unscored, "solver": solver, "statistic": statistic,
         "slack": described(slack), "ridge": ridge, "errors": errors, "memory": memory,
         "start": np.asarray(start, float).tolist(), "iterations": iterations, "tolerance": tolerance,
-        "view": _digest(seen), "predicates": _digest(_half_sure(psi, reportable)),
+        "view": digest_of(seen), "predicates": digest_of(_half_sure(psi, reportable)),
     }  # fmt: skip
     name = "RIMEO" if truths == "posterior" else f"RIMEO ({truths})"
-    first_logits = _first_logits(psi, start)
+    first_logits = initial_logits(psi, start)
 
     def build(mdp: TabularMDP) -> Learner:
-        method = _method(mdp, seen, statistic, "exact", slack, ridge, 0)
+        method = checked_method(mdp, seen, statistic, "exact", slack, ridge, 0)
         return _learner(
             name, method, perception, _half_sure(psi, reportable), configuration, first_logits,
             memory, iterations, tolerance, solver, scores != "none" and not unscored,
@@ -276,13 +277,13 @@ def rifom(
     perception = ways[form](report_classes(psi, reportable), psi)
     configuration = {
         "form": form, "statistic": statistic, "slack": described(slack), "ridge": ridge, "memory": memory,
-        "iterations": iterations, "tolerance": tolerance, "view": _digest(seen),
-        "predicates": _digest(_half_sure(psi, reportable)),
+        "iterations": iterations, "tolerance": tolerance, "view": digest_of(seen),
+        "predicates": digest_of(_half_sure(psi, reportable)),
     }  # fmt: skip
-    first_logits = _first_logits(psi, DEFAULT_START)
+    first_logits = initial_logits(psi, DEFAULT_START)
 
     def build(mdp: TabularMDP) -> Learner:
-        method = _method(mdp, seen, statistic, "exact", slack, ridge, 0)
+        method = checked_method(mdp, seen, statistic, "exact", slack, ridge, 0)
         return _learner(
             f"RIFOM ({form})", method, perception, _half_sure(psi, reportable), configuration,
             first_logits, memory, iterations, tolerance, "newton", False,
@@ -340,7 +341,7 @@ def _half_sure(psi: np.ndarray, reportable: ArrayLike | None) -> FeatureNoise:
     )
 
 
-def _first_logits(psi: np.ndarray, start: ArrayLike) -> Float[Array, " J"]:
+def initial_logits(psi: np.ndarray, start: ArrayLike) -> Float[Array, " J"]:
     """Logits that are right this often where every value of a predicate is equally common."""
     p = np.asarray(start, float)
     if p.shape not in ((), (len(psi),)):
@@ -381,7 +382,7 @@ class _Expected(NamedTuple):
 class _Alternation(NamedTuple):
     """The parts of a session."""
 
-    method: _Method
+    method: Method
     perception: Perception
     memory: float
 
@@ -431,7 +432,8 @@ class _Alternation(NamedTuple):
         weights = jnp.asarray(solution.weights)
         return _Point(
             weights, jnp.asarray(solution.values), logits, agreement,
-            jnp.maximum(_change(point.weights, weights), moved), expected.gradient, point.iterations + 1,
+            jnp.maximum(relative_change(point.weights, weights), moved), expected.gradient,
+            point.iterations + 1,
             point.solver_iterations + solution.iterations, jnp.asarray(solution.converged),
         )  # fmt: skip
 
@@ -470,7 +472,7 @@ class _Alternation(NamedTuple):
 
 def _learner(
     name: str,
-    method: _Method,
+    method: Method,
     perception: Perception,
     reporting: FeatureNoise,
     configuration: Mapping[str, Any],
@@ -495,7 +497,7 @@ def _learner(
             expected = parts.expect(state, prepared, confidence, point)
             slack, ridge = method.penalties(expected.working, state.session + 1)
             start = WarmStart(point.weights, expected.values)
-            solution = _newton(mdp, expected.working, slack, ridge, start)
+            solution = newton(mdp, expected.working, slack, ridge, start)
             return parts.advance(point, expected, perception.fit(expected.reports, point.logits), solution)
 
         def unfinished(point: _Point) -> Array:
@@ -513,7 +515,7 @@ def _learner(
     def init(key: Array) -> RIMEOState:
         key, fresh = jax.random.split(as_key(key))
         return RIMEOState(
-            _random_weights(fresh, mdp), method.statistic.empty(mdp), jnp.zeros(mdp.n_states), first_logits,
+            random_weights(fresh, mdp), method.statistic.empty(mdp), jnp.zeros(mdp.n_states), first_logits,
             perception.empty, warm, jnp.zeros((), int), key,
         )  # fmt: skip
 

@@ -79,7 +79,7 @@ def _best_possible(visits: Float[Array, "S A"]) -> Float[Array, ""]:
     return jnp.sum(xlogy(visits, visits)) - jnp.sum(xlogy(visits.sum(1), visits.sum(1)))
 
 
-def _merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Array, Fit, Array]:
+def merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Array, Fit, Array]:
     """The best of all mergers of two ways, refitted (one reward) but not climbed from; whether to take it.
 
     Ways whose greedy policies agree in every reachable state are one, whatever the score says.
@@ -161,7 +161,7 @@ def settle(program: MixtureProgram, jumble: Jumble, start: Fit) -> Fit:
         if start.mixture.proportions.shape[0] == 1:
             complexity = _complexity(program, fit.mixture, fit.kept.visits + fit.visits)
             return fit._replace(score=fit.objective - jnp.sum(complexity)), jnp.array(False)
-        better, merged, score = _merge_once(program, jumble, fit)
+        better, merged, score = merge_once(program, jumble, fit)
         fit = fit._replace(score=score)
         return jax.tree.map(lambda x, y: jnp.where(better, x, y), merged, fit), better
 

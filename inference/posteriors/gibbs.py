@@ -135,7 +135,7 @@ def sweep(
     state, evaluations = _move_weights(move_key, state, problem, reference, moves)
     if isinstance(problem.concentration, dist.Distribution):
         ways = jnp.sum(jnp.bincount(state.assignment, length=len(state.assignment)) > 0)
-        moved = _move_concentration(
+        moved = move_concentration(
             concentration_key, state.concentration, problem.concentration, ways, len(state.assignment)
         )
         state = state._replace(concentration=moved)
@@ -267,7 +267,7 @@ def _move_weights(
     return state._replace(position=position, log_likelihood=table), jnp.sum(count)
 
 
-def _move_concentration(
+def move_concentration(
     key: Array, concentration: Float[Array, ""], prior: dist.Distribution, ways: Int[Array, ""], n: int
 ) -> Float[Array, ""]:
     """Metropolis steps of random size on the concentration given the number of ways."""

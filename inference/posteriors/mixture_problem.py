@@ -31,16 +31,16 @@ from ...models.laws.occlusion import scaled_prior
 from ...models.observation.demonstration import Demonstration
 from ...models.observation.evidence import (
     Imperfection,
-    _log,
     checked_demonstration,
     fitting_sensor,
     require_possible,
+    safe_log,
 )
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted
 from ...version import __version__
 from .chains import in_threads as in_threads
-from .weights import _described, _fingerprint
+from .weights import described_prior, fingerprint
 
 # Chains start with at most this many ways: each costs a climb, and superfluous ones are given up in warmup.
 _MOST_STARTING_WAYS = 6
@@ -115,7 +115,7 @@ def resolve(
         key, weights, proportions, concentration, given = inputs
         policies = soft_policies(problem.mdp, weights)
         table = component_log_likelihoods(problem.mdp, policies, problem.perceived)[:, rows]
-        joint = _log(proportions)[:, None] + table
+        joint = safe_log(proportions)[:, None] + table
         ways = jax.random.categorical(key, joint, axis=0) if given is None else given
         counts = jnp.bincount(ways, length=len(weights))
         prior = jnp.where(counts > 0, problem.prior.log_prob(weights), 0.0)
@@ -253,14 +253,14 @@ def mixture_data(
         "key": str(np.asarray(jax.random.key_data(key)).tolist()),
         "mdp_fingerprint": problem.mdp.fingerprint(),
         "sensor": type(problem.sensor).__name__,
-        "sensor_fingerprint": _fingerprint(problem.sensor),
-        "prior": _described(problem.prior),
+        "sensor_fingerprint": fingerprint(problem.sensor),
+        "prior": described_prior(problem.prior),
         # The worst over draws where the concentration is random.
         "truncation_error": truncation_error(n, components, float(np.max(concentration))),
     }
     if isinstance(problem.concentration, dist.Distribution):
         posterior["concentration"] = concentration
-        attrs["concentration"] = _described(problem.concentration)
+        attrs["concentration"] = described_prior(problem.concentration)
     else:
         attrs["concentration"] = float(problem.concentration)
     steps = ["trajectory", "step"]

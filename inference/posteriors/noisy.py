@@ -35,7 +35,7 @@ from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted
 from ...version import __version__
 from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
-from .weights import _described, _fingerprint, gather
+from .weights import described_prior, fingerprint, gather
 
 # Nats: a mode that holds less than e^-this of the best one is no place to start a chain.
 _NEGLIGIBLE = float(np.log(100.0))
@@ -300,10 +300,10 @@ def sample_noisy_posterior(
         "i2rl_version": __version__,
         "inference": "NUTS over weights and reliabilities, truths summed out",
         "mdp_fingerprint": mdp.fingerprint(),
-        "predicates_fingerprint": _fingerprint((problem.predicates, problem.reportable)),
-        "sensor_fingerprint": _fingerprint(problem.view),
-        "prior": _described(problem.prior),
-        "reliability_prior": _described(problem.reliability_prior),
+        "predicates_fingerprint": fingerprint((problem.predicates, problem.reportable)),
+        "sensor_fingerprint": fingerprint(problem.view),
+        "prior": described_prior(problem.prior),
+        "reliability_prior": described_prior(problem.reliability_prior),
         "key": str(np.asarray(jax.random.key_data(key)).tolist()),
     }
     return az.from_dict(

@@ -34,7 +34,7 @@ from ..learners.boltzmann import (
     require_positive,
     visit_counts,
 )
-from .weights import _described
+from .weights import described_prior
 
 # Acceptance the step is tuned to: best for a random walk in several dimensions (Roberts et al. 1997).
 _TARGET_ACCEPT = 0.3
@@ -183,14 +183,14 @@ def birl(
         ),
     )  # fmt: skip
     if prior is not None and not np.isfinite(walk.lp[:, -1]).all():
-        raise ValueError(f"the prior {_described(prior)} gives no probability to weights in [-1, 1]")
+        raise ValueError(f"the prior {described_prior(prior)} gives no probability to weights in [-1, 1]")
     attrs = {
         "inference_library": "i2rl",
         "i2rl_version": __version__,
         "inference": "random-walk Metropolis-Hastings over scaled weights in [-1, 1], Boltzmann likelihood",
         "eta": float(eta),
         "mdp_fingerprint": mdp.fingerprint(),
-        "prior": "Uniform(-1, 1)" if prior is None else f"{_described(prior)} on [-1, 1]",
+        "prior": "Uniform(-1, 1)" if prior is None else f"{described_prior(prior)} on [-1, 1]",
         "key": str(np.asarray(jax.random.key_data(key)).tolist()),
     }
     steps = ["trajectory", "step"]

@@ -96,7 +96,7 @@ def nuts_chain(
     return Chain(*run_nuts(key, kernel, start, dist.biject_to(problem.prior.support), warmup, draws))
 
 
-_run_chain = jax.jit(nuts_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
+run_nuts_chain = jax.jit(nuts_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
 _potential_and_gradient = jax.jit(jax.value_and_grad(potential))
 
 
@@ -258,7 +258,7 @@ def sample_posterior(
     spread = 2.0 * np.linalg.cholesky(mode.covariance)
     starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
     run = partial(
-        _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
+        run_nuts_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
     )
     keys = jax.random.split(chain_key, chains)
     chain: Chain = in_threads(
@@ -300,8 +300,8 @@ def _inference_data(
         "inference": "NUTS over weights, hidden steps summed out; backward sampling of completions",
         "mdp_fingerprint": mdp.fingerprint(),
         "sensor": type(problem.sensor).__name__,
-        "sensor_fingerprint": _fingerprint(problem.sensor),
-        "prior": _described(problem.prior),
+        "sensor_fingerprint": fingerprint(problem.sensor),
+        "prior": described_prior(problem.prior),
     }
     steps = ["trajectory", "step"]
     idata = az.from_dict(
@@ -340,7 +340,8 @@ def _inference_data(
     return idata
 
 
-def _fingerprint(tree: object) -> str:
+def fingerprint(tree: object) -> str:
+    """Digest the arrays of a pytree, with their types and shapes."""
     digest = hashlib.sha256()
     for leaf in jax.tree.leaves(tree):
         array = np.ascontiguousarray(leaf)
@@ -348,10 +349,10 @@ def _fingerprint(tree: object) -> str:
     return digest.hexdigest()
 
 
-def _described(prior: dist.Distribution) -> str:
+def described_prior(prior: dist.Distribution) -> str:
     """A distribution with its parameters, through the wrappers that only shape it."""
     if isinstance(prior, ScaledPrior):
-        scale, base = np.asarray(prior.scale), _described(prior.base)
+        scale, base = np.asarray(prior.scale), described_prior(prior.base)
         return base if (scale == 1).all() else f"{base} on weights times {scale.tolist()}"
     while hasattr(prior, "base_dist") and type(prior) in (dist.Independent, dist.ExpandedDistribution):
         prior = prior.base_dist

@@ -10,7 +10,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
 from scipy import optimize, sparse
 
-from ...models.process.mdp import TabularMDP, _PairNames
+from ...models.process.mdp import PairNames, TabularMDP
 from ...models.process.planning import reachable_states, require_discounted
 from ...models.process.units import feature_scale, with_scaled_features
 
@@ -236,7 +236,7 @@ def failure(mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike, reason: st
             f"the maximum-entropy program was not solved ({reason}). Some policy meets its constraints and "
             "takes every action, so its weights are finite: a slack or a ridge makes it easier to solve"
         )
-    name = _PairNames(mdp.labels)
+    name = PairNames(mdp.labels)
     avoided = "; ".join(name.pair(s, a) for s, a in zip(states[:5], actions[:5], strict=True))
     more = f" and {len(states) - 5} more" if len(states) > 5 else ""
     return ProgramNotSolved(

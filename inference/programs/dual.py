@@ -25,10 +25,10 @@ _QUIET: dict[str, Any] = {
     "calc_lam_p": False,
     "ipopt.max_iter": 200,
 }
-_COLD: dict[str, Any] = {**_QUIET, "ipopt.tol": 1e-9}
+COLD_OPTIONS: dict[str, Any] = {**_QUIET, "ipopt.tol": 1e-9}
 # A previous session's solution lies on its bounds: without these, IPOPT would first push it back inside.
-_WARM: dict[str, Any] = {
-    **_COLD,
+WARM_OPTIONS: dict[str, Any] = {
+    **COLD_OPTIONS,
     "ipopt.warm_start_init_point": "yes",
     "ipopt.mu_init": 1e-9,
     "ipopt.warm_start_bound_push": 1e-10,
@@ -140,8 +140,8 @@ class _SoftBellmanProgram:
         # Strictly feasible: IPOPT leaves the boundary in directions that lead it far astray.
         values = soft_values(mdp, jnp.zeros(n_features)) + 1 / (1 - mdp.discount)
         self._origin = np.concatenate([np.zeros(2 * n_features), values])
-        self._cold = ca.nlpsol("maxent_cold", "ipopt", program, _COLD)
-        self._warm = ca.nlpsol("maxent_warm", "ipopt", program, _WARM)
+        self._cold = ca.nlpsol("maxent_cold", "ipopt", program, COLD_OPTIONS)
+        self._warm = ca.nlpsol("maxent_warm", "ipopt", program, WARM_OPTIONS)
 
     def _run(self, problem: _Problem, warm: IpoptPoint | None) -> tuple[DualSolution, str]:
         """Solve from the first start that leads somewhere; status '' means solved.

@@ -249,9 +249,10 @@ class _Expansion(NamedTuple):
     scale: Float[Array, ""]
 
 
-def _expand(
+def expand(
     mdp: TabularMDP, objective: LinearObjective, weights: Float[Array, " K"], values: Float[Array, " S"]
 ) -> _Expansion:
+    """Expand the objective to second order around a point."""
     q = mdp.features @ weights + mdp.discount * mdp.expect_next(values)
     policy = jax.nn.softmax(jnp.where(mdp.available, q, -jnp.inf), axis=1)
     to_go = features_to_go(mdp, policy)
@@ -275,7 +276,7 @@ def count_information(
     At weights whose soft values are ``values [S]``. Positive semi-definite always; exact where the visits
     flow as the soft policy's would.
     """
-    return _expand(mdp, count_objective(mdp, counts), weights, values).hessian
+    return expand(mdp, count_objective(mdp, counts), weights, values).hessian
 
 
 def _kkt_residual(
@@ -334,7 +335,7 @@ def minimise(
         damping: Float[Array, ""],
         iterations: Int[Array, ""],
     ) -> _Iterate:
-        at = _expand(mdp, objective, weights, values)
+        at = expand(mdp, objective, weights, values)
         residual = _kkt_residual(at.gradient + ridge * weights, slack, weights)
         relative = residual / jnp.where(at.scale > 0, at.scale, 1.0)
         finished = relative <= _TARGET_RESIDUAL

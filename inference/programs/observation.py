@@ -28,7 +28,7 @@ from scipy.sparse import csgraph
 
 from ...models.observation.agreement import PredicateClasses, agreement_patterns, predicate_classes
 from .constraints import ProgramNotSolved
-from .dual import _COLD, _WARM, IpoptPoint
+from .dual import COLD_OPTIONS, WARM_OPTIONS, IpoptPoint
 
 # The curvature along a direction that reports say nothing about is zero but for rounding.
 _FLAT = 1e-10
@@ -276,8 +276,8 @@ class ObservationProgram:
             "p": ca.vertcat(truths, blamed, target, slack),
             "f": ca.sum1(plus) + log_z - ca.dot(plus - minus, target) + ca.dot(slack, plus + minus),
         }
-        self._cold = ca.nlpsol("observation_cold", "ipopt", program, _COLD)
-        self._warm = ca.nlpsol("observation_warm", "ipopt", program, _WARM)
+        self._cold = ca.nlpsol("observation_cold", "ipopt", program, COLD_OPTIONS)
+        self._warm = ca.nlpsol("observation_warm", "ipopt", program, WARM_OPTIONS)
 
     def solve(
         self,

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
 from ...models.process.units import feature_scale, with_scaled_features
-from .session import Learner
+from .learner import Learner
 from .statistic import FeatureStatistic
 
 

@@ -23,17 +23,17 @@ from ..inputs.arguments import as_key
 from ..observation.demonstration import PAD, SEEN, UNKNOWN
 from ..observation.evidence import (
     Imperfection,
-    _log,
     checked_codes,
     fitting_sensor,
     observe,
+    safe_log,
     step_log_evidence,
 )
 from ..process.mdp import TabularMDP
 from ..process.planning import reward_of, simulate, soft_plan
 from .chain import filter_all
 from .occlusion import scaled_prior
-from .trajectory import _Codes
+from .trajectory import CodesConstraint
 
 COMPONENTS = 10
 
@@ -220,7 +220,7 @@ class MixtureLaw(dist.Distribution):
     @property
     def support(self) -> constraints.Constraint:
         """Integer codes of known kinds, states and actions."""
-        return _Codes(self.mdp.n_states, self.mdp.n_actions)
+        return CodesConstraint(self.mdp.n_states, self.mdp.n_actions)
 
     def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Int[Array, "... L 3"]:
         """Simulate what would be perceived."""
@@ -244,7 +244,7 @@ class MixtureLaw(dist.Distribution):
             raise ValueError(f"a value has shape [..., {self.length}, 3], got {value.shape}")
         perceived = as_evidence(self.mdp, self.sensor, value.reshape((-1, self.length, 3)))
         each = component_log_likelihoods(self.mdp, self.log_policies, perceived)
-        return jax.nn.logsumexp(_log(self.proportions) + each.T.reshape((*value.shape[:-2], -1)), axis=-1)
+        return jax.nn.logsumexp(safe_log(self.proportions) + each.T.reshape((*value.shape[:-2], -1)), axis=-1)
 
 
 def concentration_prior(
@@ -325,7 +325,7 @@ def mixture_model(
     weights = numpyro.sample("weights", each)
     if isinstance(codes, Perceived):
         table = component_log_likelihoods(mdp, soft_policies(mdp, weights), codes)
-        mixed = jax.nn.logsumexp(_log(proportions)[:, None] + table, axis=0)
+        mixed = jax.nn.logsumexp(safe_log(proportions)[:, None] + table, axis=0)
         numpyro.factor("demonstration", codes.repeats * mixed)
         return None
     if codes is not None:

@@ -18,7 +18,7 @@ from ..process.planning import reward_of, simulate, soft_plan
 from .chain import filter_all
 
 
-class _Codes(constraints.Constraint):
+class CodesConstraint(constraints.Constraint):
     """Codes (kind, state, action) of known kinds, states and actions."""
 
     is_discrete = True
@@ -29,6 +29,7 @@ class _Codes(constraints.Constraint):
         super().__init__()
 
     def __call__(self, x: Int[Array, "... L 3"]) -> Bool[Array, "..."]:
+        """Return whether codes are of known kinds, states and actions."""
         kind, state, action = x[..., 0], x[..., 1], x[..., 2]
         inside = (
             (state >= UNKNOWN) & (state < self.n_states) & (action >= UNKNOWN) & (action < self.n_actions)
@@ -38,9 +39,11 @@ class _Codes(constraints.Constraint):
         return jnp.all((kind >= PAD) & (kind <= LOST) & inside & seen, axis=-1) & ended
 
     def feasible_like(self, prototype: Array) -> Array:
+        """Return hidden steps of the shape of ``prototype``."""
         return jnp.broadcast_to(jnp.array([HIDDEN, UNKNOWN, UNKNOWN], jnp.int32), prototype.shape)
 
     def tree_flatten(self) -> tuple:
+        """Flatten for JAX: no leaves."""
         return (), ((), {"n_states": self.n_states, "n_actions": self.n_actions})
 
 
@@ -88,7 +91,7 @@ class TrajectoryLaw(dist.Distribution):
     @property
     def support(self) -> constraints.Constraint:
         """Integer codes of known kinds, states and actions."""
-        return _Codes(self.mdp.n_states, self.mdp.n_actions)
+        return CodesConstraint(self.mdp.n_states, self.mdp.n_actions)
 
     def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Int[Array, "... L 3"]:
         """Simulate what would be perceived."""

@@ -19,7 +19,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ..inputs.arguments import as_key, concrete, described, is_traced, rebuilt_unchecked
 from ..inputs.probabilities import normalised, sum_tolerance
-from ..process.mdp import TabularMDP, _PairNames
+from ..process.mdp import PairNames, TabularMDP
 from .demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
 
 
@@ -184,7 +184,7 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
         """From ``O(o | s, a)`` as ``[S, A, S, A]``; ``ValueError`` unless each truth's row sums to one."""
         o = concrete("observation probabilities", probabilities)
         if o is None:
-            return ObservationModel._make((_log(jnp.asarray(probabilities, float)),))
+            return ObservationModel._make((safe_log(jnp.asarray(probabilities, float)),))
         if not np.isfinite(o).all() or (o < 0).any():
             raise ValueError("observation probabilities must be non-negative numbers")
         _row_sums(o, probabilities)
@@ -223,9 +223,9 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
         del score  # a fixed confusion takes no account of confidence
         table = self.log_probabilities
         by_state = jnp.where(
-            state == UNKNOWN, _log(jnp.sum(jnp.exp(table), axis=2)), table[:, :, jnp.maximum(state, 0)]
+            state == UNKNOWN, safe_log(jnp.sum(jnp.exp(table), axis=2)), table[:, :, jnp.maximum(state, 0)]
         )
-        summed = _log(jnp.sum(jnp.exp(by_state), axis=2))
+        summed = safe_log(jnp.sum(jnp.exp(by_state), axis=2))
         return jnp.where(action == UNKNOWN, summed, by_state[:, :, jnp.maximum(action, 0)])
 
     def report(
@@ -523,15 +523,15 @@ def step_log_evidence(
         reading = jnp.where(match_state[:, None] & match_action, 0.0, -jnp.inf)
     else:
         reading = sensor.reading.log_likelihood(state, action, score)
-    seen = reading + _log(presence)[:, None]
-    hidden = jnp.broadcast_to(_log(1 - presence)[:, None], shape)
+    seen = reading + safe_log(presence)[:, None]
+    hidden = jnp.broadcast_to(safe_log(1 - presence)[:, None], shape)
     # An index beyond an array is clamped to its last entry: it would be learned from as another state.
     in_range = (state >= UNKNOWN) & (state < n_states) & (action >= UNKNOWN) & (action < n_actions)
     nothing = jnp.where((kind == LOST) | (kind == PAD), jnp.zeros(shape), -jnp.inf)
     return jnp.where((kind == SEEN) & in_range, seen, jnp.where(kind == HIDDEN, hidden, nothing))
 
 
-def _log(probability: Array) -> Array:
+def safe_log(probability: Array) -> Array:
     """Logarithm with ``log 0 = -inf`` and a zero, not NaN, gradient there."""
     return jnp.where(probability > 0, jnp.log(jnp.where(probability > 0, probability, 1.0)), -jnp.inf)
 
@@ -586,7 +586,7 @@ def require_possible(
     demonstration = checked_demonstration(mdp, demonstration, record=record)
     successors, possible_move = np.asarray(mdp.successors), np.asarray(mdp.probabilities) > 0
     available = np.asarray(mdp.available)
-    name = _PairNames(mdp.labels)
+    name = PairNames(mdp.labels)
     names = {SEEN: "seen", HIDDEN: "hidden", LOST: "lost"}
     start = np.asarray(mdp.initial) > 0
     presence = np.ones(mdp.n_states) if sensor.presence is None else np.asarray(sensor.presence)

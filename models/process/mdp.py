@@ -143,7 +143,7 @@ class TabularMDP:
         if not np.issubdtype(successors.dtype, np.integer):
             raise ValueError(f"successors must be integers (indices of states), got {successors.dtype}")
         labels = _checked_labels(states, actions, feature_names, n_states, n_actions, features)
-        name = _PairNames(labels)
+        name = PairNames(labels)
         if features.ndim != 3 or features.shape[:2] != (n_states, n_actions) or features.shape[2] == 0:
             raise ValueError(
                 f"features must have shape [S, A, K] = [{n_states}, {n_actions}, K >= 1], "
@@ -364,21 +364,25 @@ def _from_rows(rows: sparse.csr_array, dtype: np.dtype, features: np.ndarray, **
 
 
 @dataclass(frozen=True)
-class _PairNames:
+class PairNames:
     """Names for error messages, looked up one at a time (a million states need no million names)."""
 
     labels: Labels
 
     def state(self, s: int) -> str:
+        """Return the name of a state, with its number."""
         return f"{shortened(self.labels.states[s])} ({s})" if self.labels.states else f"{int(s)}"
 
     def action(self, a: int) -> str:
+        """Return the name of an action, with its number."""
         return f"{shortened(self.labels.actions[a])} ({a})" if self.labels.actions else f"{int(a)}"
 
     def feature(self, k: int) -> str:
+        """Return the name of a feature, with its number."""
         return f"{shortened(self.labels.features[k])} ({k})" if self.labels.features else f"{int(k)}"
 
     def pair(self, s: int, a: int) -> str:
+        """Return the names of a state-action pair."""
         return f"state {self.state(s)}, action {self.action(a)}"
 
 
@@ -419,7 +423,7 @@ def _check_transitions(
     probabilities: np.ndarray,
     available: np.ndarray,
     n_states: int,
-    name: _PairNames,
+    name: PairNames,
     tolerance: float,
 ) -> None:
     mask = available[..., None]

@@ -22,7 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..inputs.arguments import as_key, is_traced
-from .mdp import TabularMDP, _PairNames
+from .mdp import PairNames, TabularMDP
 
 # Up to here a dense [S, S] factorisation beats Krylov iterations (0.1 ms at 124 states, 12 ms at 1024).
 DIRECT_LIMIT = 1500
@@ -64,7 +64,7 @@ def reward_of(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A
     if not is_traced(weights) and np.isnan(np.asarray(weights)).any():
         k = int(np.argwhere(np.isnan(np.asarray(weights)))[0, 0])
         raise ValueError(
-            f"weights must be numbers; that of feature {_PairNames(mdp.labels).feature(k)} is nan"
+            f"weights must be numbers; that of feature {PairNames(mdp.labels).feature(k)} is nan"
         )
     return mdp.features @ weights
 
@@ -95,7 +95,7 @@ def _require_numbers(mdp: TabularMDP, what: str, table: Any) -> None:
     wrong = np.isnan(np.asarray(table)) & np.asarray(mdp.available)
     if wrong.any():
         *_, s, a = np.argwhere(wrong)[0]
-        raise ValueError(f"the {what} of {_PairNames(mdp.labels).pair(s, a)} is nan, not a number")
+        raise ValueError(f"the {what} of {PairNames(mdp.labels).pair(s, a)} is nan, not a number")
 
 
 def soft_plan(

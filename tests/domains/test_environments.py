@@ -6,9 +6,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 from scipy import stats
 
-from i2rl.domains import instance, labyrinth, sorting_with_claiming
+from i2rl.domains import instance, mouse_labyrinth, sorting_with_claiming
 from i2rl.domains.environments import ENVIRONMENTS, TabularEnv
-from i2rl.domains.gym.pictures import Frame, maze_layout
+from i2rl.domains.gym.canvas import Frame
+from i2rl.domains.labyrinth.picture import maze_layout
 from i2rl.domains.labyrinth.process import HOME, N_NODES, parent_of
 
 IDS = tuple(ENVIRONMENTS)
@@ -244,8 +245,8 @@ def test_the_maze_is_drawn_as_it_is_walked():
 
 
 def test_captions_name_what_was_done():
-    from i2rl.domains.gym.pictures import caption
+    from i2rl.domains.gym.canvas import caption
 
-    mdp = labyrinth().mdp
+    mdp = mouse_labyrinth().mdp
     assert caption(mdp, Frame(0)) == f"begins\n{mdp.state_names[0]}"
     assert caption(mdp, Frame(0, 0, 0.25)).startswith("back, reward 0.25\n")

@@ -32,9 +32,9 @@ from jaxtyping import Float, Int
 from scipy import stats
 
 from ....domains.noisy.tasks import NoisyTask, demonstrate_noisy, noisy_patrol, noisy_sorting
-from ....domains.object_world.process import object_world
+from ....domains.object_world.process import random_object_world
 from ....inference.completion.smoothing import Evidence, smooth_all
-from ....inference.learners.lme import _method, _newton
+from ....inference.learners.alternation import checked_method, newton
 from ....inference.learners.noisy import DEFAULT_ERRORS, DEFAULT_MEMORY, DEFAULT_RIDGE, rifom, rimeo
 from ....inference.programs.maximum_entropy import WarmStart
 from ....inference.sensors.observations import (
@@ -45,7 +45,7 @@ from ....inference.sensors.observations import (
     session_reports,
 )
 from ....inference.sensors.reliabilities import entropic_perception, prepare
-from ....inference.sessions.session import Learner
+from ....inference.sessions.learner import Learner
 from ....inference.sessions.statistic import blend, complete
 from ....models.observation.demonstration import Demonstration
 from ....models.observation.evidence import Sensor
@@ -95,7 +95,7 @@ def random_stream(size: int, predicates: int, sessions: int, *, named: bool = Fa
     tenth of the reports are of any pair; the expert is soft.
     """
     rng = np.random.default_rng(seed)
-    world = object_world(jax.random.key(seed), size, 0, slip=0.1, discount=0.95)
+    world = random_object_world(jax.random.key(seed), size, 0, slip=0.1, discount=0.95)
     mdp = world.mdp
     psi = rng.integers(0, 2, (predicates, *mdp.available.shape))
     if named:
@@ -202,7 +202,7 @@ def part_seconds(task: NoisyTask, sessions: int = 20, runs: int = 200) -> dict[s
     state = learner.init(jax.random.key(0))
     for one in stream.seen.sessions(stream.trajectories):
         state, _ = learner.update(state, one)
-    method = _method(mdp, Sensor(), "seen", "exact", 0.0, DEFAULT_RIDGE, 0)
+    method = checked_method(mdp, Sensor(), "seen", "exact", 0.0, DEFAULT_RIDGE, 0)
     perception = entropic_perception(classes, "stepwise", "posterior", DEFAULT_ERRORS, DEFAULT_MEMORY)
     session = prepare(mdp, classes, one.bucketed(), True)
     confidence = session.reports.score[..., None, None]
@@ -234,7 +234,7 @@ def part_seconds(task: NoisyTask, sessions: int = 20, runs: int = 200) -> dict[s
             (state.logits, session.reports, posterior.pairs),
         ),
         "fit of the sensor": (perception.fit, (heard, state.logits)),
-        "fit of the reward": (lambda x: _newton(mdp, x, slack, ridge, start), (working,)),
+        "fit of the reward": (lambda x: newton(mdp, x, slack, ridge, start), (working,)),
         "preparing the reports": (lambda x: session_reports(classes, x), (one.bucketed(),)),
     }
     found = {}

@@ -26,7 +26,7 @@ from ....domains.patrol.process import demonstrate, instance
 from ....inference.learners.lme import batch_lme, lme_i2rl
 from ....inference.programs.constraints import FeatureTarget
 from ....inference.programs.dual import CountProgram, DualProgram
-from ....inference.sessions.session import run_sessions
+from ....inference.sessions.running import run_sessions
 from ....models.observation.demonstration import HIDDEN, UNKNOWN, Demonstration
 from ....models.observation.evidence import Visibility
 from ....models.process.mdp import TabularMDP

@@ -39,7 +39,8 @@ from ....inference.programs.finite_horizon import expected_features, fit_weights
 from ....inference.programs.maximum_entropy import exponentiated_gradient, fit_counts, solve_dual
 from ....inference.programs.minmax import MinMaxProgram
 from ....inference.programs.primal import PrimalProgram
-from ....inference.sessions.session import Learner, run_sessions
+from ....inference.sessions.learner import Learner
+from ....inference.sessions.running import run_sessions
 from ....models.laws.trajectory import TrajectoryLaw, sample_demonstration
 from ....models.observation.demonstration import Demonstration
 from ....models.observation.evidence import FeatureNoise, Imperfection, Sensor, Visibility

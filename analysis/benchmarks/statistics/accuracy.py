@@ -19,7 +19,7 @@ from jaxtyping import Float
 
 from ....domains.patrol.process import demonstrate, instance
 from ....inference.learners.lme import batch_lme, lme_i2rl
-from ....inference.sessions.session import run_sessions
+from ....inference.sessions.running import run_sessions
 from ...judging.metrics import evaluate
 from ..harness import print_table, publish
 

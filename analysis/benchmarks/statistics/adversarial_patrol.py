@@ -36,7 +36,7 @@ from ....inference.adversarial.tabular.learners import (
     robust_gail_tabular,
 )
 from ....inference.learners.lme import lme_i2rl
-from ....inference.sessions.session import Learner
+from ....inference.sessions.learner import Learner
 from ....models.observation.demonstration import Demonstration
 from ...studies.adversarial import results as methods
 from ...studies.adversarial.patrol import (

@@ -40,8 +40,8 @@ from jaxtyping import Array, Float
 
 from ....domains.patrol.process import Patrol, demonstrate, instance
 from ....inference.learners.lme import DEFAULT_SLACK, lme_i2rl, me_i2rl
+from ....inference.sessions.learner import Learner
 from ....inference.sessions.schedule import Harmonic, Schedule
-from ....inference.sessions.session import Learner
 from ....models.observation.demonstration import Demonstration
 from ....models.observation.evidence import Imperfection, Sensor, observe
 from ....models.process.planning import occupancy, reward_of, simulate, soft_plan

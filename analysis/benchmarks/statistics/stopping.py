@@ -33,7 +33,7 @@ from jaxtyping import Float
 
 from ....domains.patrol.process import Patrol, demonstrate, instance
 from ....inference.learners.lme import lme_i2rl
-from ....inference.sessions.session import run_streams
+from ....inference.sessions.fleets import run_streams
 from ....models.observation.demonstration import Demonstration
 from ....models.process.planning import deterministic_policy, hard_plan, reward_of
 from ...bounds.stopping import (

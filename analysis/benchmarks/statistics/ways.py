@@ -32,7 +32,7 @@ from ....domains.sorting.process import (
 )
 from ....inference.learners.mtirl import BatchMixture, assign_trajectories, batch_mme_mtirl, mme_mtirl
 from ....inference.mixtures.clustering import Clustering
-from ....inference.sessions.session import Learner
+from ....inference.sessions.learner import Learner
 from ....models import Demonstration, Sensor, TrajectoryLaw, Visibility, concatenate
 from ....models.observation.demonstration import HIDDEN, UNKNOWN
 from ...judging.multi_task import adjusted_rand_index, assignment_accuracy, expected_value_difference

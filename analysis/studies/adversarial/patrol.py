@@ -30,7 +30,8 @@ from ....inference.adversarial.tabular.learners import (
     robust_airl_with_learned_sensor,
 )
 from ....inference.completion.smoothing import evidence_of, smooth_all
-from ....inference.sessions.session import Learner, run_streams
+from ....inference.sessions.fleets import run_streams
+from ....inference.sessions.learner import Learner
 from ....models.observation.confusions import Confusions
 from ....models.observation.demonstration import PAD, UNKNOWN, Demonstration
 from ....models.observation.evidence import Sensor, observe

@@ -32,7 +32,7 @@ from ....inference.adversarial.policy_optimisation import ppo
 from ....inference.adversarial.robust import Smoothed, robust_airl, robust_airl_with_sensor
 from ....inference.adversarial.self_supervised import SSRRTraining, ssrr
 from ....inference.adversarial.snippets import Regression
-from ....inference.sessions.session import Learner
+from ....inference.sessions.learner import Learner
 from ....models.inputs.archives import StorageError
 from ....models.observation.recordings import Recording, distort
 from ...judging.returns import EmpiricalILE, bounded_ile, returns_at_fixed_length

@@ -20,7 +20,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 from scipy import stats
 
-from ....domains.object_world.process import ObjectWorld, object_world, without_blocked_moves
+from ....domains.object_world.process import ObjectWorld, random_object_world, without_blocked_moves
 from ....domains.sorting.line import Share, wilson
 from ....inference.learners.boltzmann import boltzmann_log_policy, optimal_action_values
 from ....models.process.mdp import Labels, TabularMDP
@@ -173,7 +173,7 @@ def study(
             f"got {worlds}, {trajectories} and {len(settings)}"
         )
     layout, walk = jax.random.split(jax.random.key(seed))
-    drawn = [object_world(key, walls=walls) for key in jax.random.split(layout, worlds)]
+    drawn = [random_object_world(key, walls=walls) for key in jax.random.split(layout, worlds)]
     stacked = {
         True: _stacked([world.mdp for world in drawn]),
         False: _stacked([without_blocked_moves(world).mdp for world in drawn]),

@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from ....domains.gym.pictures import maze_layout
+from ....domains.labyrinth.picture import maze_layout
 from ....domains.labyrinth.process import (
     ACTIONS,
     BACK,
@@ -146,7 +146,7 @@ def draw_maze(
 ) -> None:
     """Draw corridors coloured by the value of the node they lead to (none: NaN); hidden ones are hatched.
 
-    The maze lies as its environment draws it (:func:`i2rl.domains.gym.pictures.maze_layout`).
+    The maze lies as its environment draws it (:func:`i2rl.domains.labyrinth.picture.maze_layout`).
     """
     position = maze_layout()
 

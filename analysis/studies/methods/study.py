@@ -21,7 +21,8 @@ from ....domains.patrol.process import LEFT, RIGHT, Patrol, demonstrate, instanc
 from ....inference.learners.darko import darko_i2rl, goal_sessions
 from ....inference.learners.jin import jin_i2rl, jin_i2rl_with_features
 from ....inference.learners.lme import lme_i2rl, lme_i2rl_with_random_weights, me_i2rl
-from ....inference.sessions.session import Learner, run_sessions
+from ....inference.sessions.learner import Learner
+from ....inference.sessions.running import run_sessions
 from ....models.observation.demonstration import SEEN, Demonstration
 from ....models.observation.evidence import Sensor
 from ....models.process.mdp import TabularMDP

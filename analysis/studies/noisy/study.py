@@ -31,7 +31,9 @@ from ....inference.learners.lme import lme_i2rl
 from ....inference.learners.maximum_likelihood import mlirl
 from ....inference.learners.noisy import DEFAULT_ITERATIONS, DEFAULT_RIDGE, rifom, rimeo, robust_irl
 from ....inference.sensors.reliabilities import WithTruth
-from ....inference.sessions.session import Learner, run_sessions, run_streams
+from ....inference.sessions.fleets import run_streams
+from ....inference.sessions.learner import Learner
+from ....inference.sessions.running import run_sessions
 from ....models.observation.demonstration import SEEN, Demonstration
 from ....models.observation.evidence import Imperfection, Sensor, Visibility
 from ....models.process.mdp import TabularMDP

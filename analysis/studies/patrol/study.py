@@ -17,7 +17,8 @@ from ....domains.patrol.process import Patrol, demonstrate, instance, simulate_p
 from ....domains.patrol.trials import REACHED, TIMED_OUT, BreachOutcome, breach_trials, greedy_policies
 from ....inference.completion.smoothing import evidence_of, smooth_all
 from ....inference.learners.lme import batch_lme, lme_i2rl, lme_i2rl_with_random_weights
-from ....inference.sessions.session import Learner, run_sessions
+from ....inference.sessions.learner import Learner
+from ....inference.sessions.running import run_sessions
 from ....models.observation.demonstration import SEEN, Demonstration, concatenate
 from ....models.observation.evidence import observe
 from ....models.process.planning import reward_of, soft_plan

@@ -27,7 +27,7 @@ from ....inference.learners.mtirl import (
     mme_mtirl,
 )
 from ....inference.mixtures.clustering import Clustering
-from ....inference.sessions.session import Learner
+from ....inference.sessions.learner import Learner
 from ....models.observation.demonstration import Demonstration
 from ....models.process.mdp import TabularMDP
 from ...judging.multi_task import (

@@ -47,9 +47,8 @@ from ...completion.transitions import (
     summarised,
     wide_successors,
 )
-from ...learners.lme import _digest
 from ...sensors.confusions import ConfusionNoise, ConfusionStatistic, confusion_counts, fitted_confusions
-from ...sessions.session import Learner, in_plain_numbers
+from ...sessions.learner import Learner, digest_of, in_plain_numbers
 from ...sessions.statistic import blend
 from .discriminator import (
     AVERAGES,
@@ -147,7 +146,7 @@ def gibbs_airl_tabular(
         "draws": draws,
         "burn_in": burn_in,
         "change": change,
-        "sensor": _digest(sensor),
+        "sensor": digest_of(sensor),
     }
     look = _Look(truth, np.asarray(mdp.successors), sensor)
     return _learner("robust-AIRL, Gibbs", mdp, look, tabular_airl, _AIRL, options, settings)
@@ -177,7 +176,7 @@ def robust_airl_with_learned_sensor(
         raise ValueError(f"learning starts from probabilities in (0, 1); that of confusion {m} is {noise[m]}")
     sensor = fitting_sensor(Sensor(None if view is None else view.presence, assumed.reading), mdp)
     known: Any = (assumed, view)
-    settings = {"truth": "exact, sensor learned", "trust": trust, "sensor": _digest(known)}
+    settings = {"truth": "exact, sensor learned", "trust": trust, "sensor": digest_of(known)}
     look = _Look(_exact(mdp), np.asarray(mdp.successors), sensor, assumed, trust)
     return _learner("robust-AIRL, sensor learned", mdp, look, tabular_airl, _AIRL, options, settings)
 
@@ -232,7 +231,7 @@ def _in_expectation(
 ) -> Learner:
     sensor = fitting_sensor(sensor, mdp)
     look = _Look(_exact(mdp), np.asarray(mdp.successors), sensor)
-    settings = {"truth": "exact", "sensor": _digest(sensor)}
+    settings = {"truth": "exact", "sensor": digest_of(sensor)}
     return _learner(name, mdp, look, kind, defaults, options, settings)
 
 
@@ -384,7 +383,7 @@ def _learner(
         return new, in_plain_numbers(report, time.perf_counter() - began)
 
     known: Any = features
-    digest = {"features": _digest(known), "network": {k: list(v) for k, v in layers.items()}}
+    digest = {"features": digest_of(known), "network": {k: list(v) for k, v in layers.items()}}
     configuration = {"discriminator": discriminator.name, **how._asdict(), **digest, **settings}
     return Learner(name, mdp, configuration, init, update, session)
 

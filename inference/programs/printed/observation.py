@@ -16,7 +16,7 @@ from jaxtyping import Float
 
 from ....models.observation.agreement import predicate_classes, reported_matches
 from ..constraints import ProgramNotSolved
-from ..dual import _COLD
+from ..dual import COLD_OPTIONS
 
 _PENALTIES = (1.0, 10.0, 100.0, 1e3, 1e4)
 # Entropy has no derivative at the ends of the unit interval.
@@ -108,7 +108,8 @@ def solve_printed_program(
     log_products = ca.DM(events) @ ca.log(p) + ca.DM(1 - events) @ ca.log(1 - p)
     misses = ca.dot(total, (ca.exp(log_products) - mean) ** 2)
     entropy = -ca.dot(p, ca.log(p)) - ca.dot(1 - p, ca.log(1 - p))
-    solver = ca.nlpsol("printed", "ipopt", {"x": p, "p": penalty, "f": penalty / 2 * misses - entropy}, _COLD)
+    program = {"x": p, "p": penalty, "f": penalty / 2 * misses - entropy}
+    solver = ca.nlpsol("printed", "ipopt", program, COLD_OPTIONS)
     start, iterations = np.full(n_predicates, 0.5), 0
     for v in _PENALTIES:
         result = solver(x0=start, p=v, lbx=_INSIDE, ubx=1 - _INSIDE)

@@ -39,9 +39,9 @@ def demonstration(mdp, sensor):
 
 @pytest.fixture(scope="module")
 def by_session(mdp, sensor, demonstration):
-    before = diagnostics._run_chain._cache_size()
+    before = diagnostics.run_nuts_chain._cache_size()
     idata = posterior_by_session(jax.random.key(0), mdp, sensor, demonstration, AT, trajectories=2, **OPTIONS)
-    assert diagnostics._run_chain._cache_size() == before + 1
+    assert diagnostics.run_nuts_chain._cache_size() == before + 1
     return idata
 
 

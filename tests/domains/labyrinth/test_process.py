@@ -20,9 +20,9 @@ from i2rl.domains.labyrinth.process import (
     Bout,
     conceal,
     demonstration_of,
-    labyrinth,
     labyrinth_by_level,
     level_of,
+    mouse_labyrinth,
     nodes_of,
     pairs_of,
     parent_of,
@@ -33,7 +33,7 @@ from i2rl.models.observation.demonstration import HIDDEN, PAD, SEEN, Demonstrati
 from i2rl.models.observation.evidence import require_possible
 from i2rl.models.process.planning import reachable_states, reward_of, soft_plan
 
-MAZE = labyrinth(0.8)
+MAZE = mouse_labyrinth(0.8)
 
 
 def weights_of(**by_feature):

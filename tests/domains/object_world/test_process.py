@@ -9,7 +9,7 @@ from i2rl.domains.object_world.process import (
     ACTIONS,
     STAY,
     STEPS,
-    object_world,
+    random_object_world,
     walled_world,
     without_blocked_moves,
 )
@@ -18,7 +18,7 @@ from i2rl.models import hard_plan, reward_of
 
 @pytest.mark.parametrize("seed", range(5))
 def test_every_free_cell_is_reachable_from_every_other(seed):
-    world = object_world(jax.random.key(seed), 10, 40)
+    world = random_object_world(jax.random.key(seed), 10, 40)
     assert world.walls.sum() == 40
     assert len(world.cells) == world.mdp.n_states == 60
     edges = _edges(world)
@@ -47,7 +47,7 @@ def test_moves_go_one_cell_and_walls_and_edges_block():
 
 
 def test_optimal_values_are_those_of_the_shortest_way():
-    world = object_world(jax.random.key(3), 8, 15, discount=0.9)
+    world = random_object_world(jax.random.key(3), 8, 15, discount=0.9)
     plan = hard_plan(world.mdp, reward_of(world.mdp, jnp.asarray(world.weights)))
     ways = shortest_path(_edges(world), unweighted=True)
     nearest = np.minimum(*(ways[:, world.state_of(cell)] for cell in world.objects))
@@ -71,13 +71,13 @@ def test_a_slip_goes_in_any_direction_but_staying_is_sure():
 
 
 def test_the_same_key_draws_the_same_world():
-    one, again, other = (object_world(jax.random.key(k)) for k in (1, 1, 2))
+    one, again, other = (random_object_world(jax.random.key(k)) for k in (1, 1, 2))
     assert one.mdp.fingerprint() == again.mdp.fingerprint()
     assert (one.walls != other.walls).any()
 
 
 def test_without_blocked_moves_only_choices_go():
-    world = object_world(jax.random.key(0), 6, 8)
+    world = random_object_world(jax.random.key(0), 6, 8)
     restricted = without_blocked_moves(world)
     available = np.asarray(restricted.mdp.available)
     nowhere = np.asarray(world.mdp.successors)[..., 0] == np.arange(world.mdp.n_states)[:, None]
@@ -87,9 +87,9 @@ def test_without_blocked_moves_only_choices_go():
 
 
 def test_a_crowded_world_is_still_found_and_an_impossible_one_is_refused():
-    assert object_world(jax.random.key(0), 2, 0).mdp.n_states == 4
+    assert random_object_world(jax.random.key(0), 2, 0).mdp.n_states == 4
     with pytest.raises(ValueError, match=r"no connected layout of 2 walls in 2 x 2 cells"):
-        object_world(jax.random.key(0), 2, 2)
+        random_object_world(jax.random.key(0), 2, 2)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_a_crowded_world_is_still_found_and_an_impossible_one_is_refused():
 )
 def test_impossible_worlds_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        object_world(jax.random.key(0), **options)
+        random_object_world(jax.random.key(0), **options)
 
 
 def test_walls_given_are_checked():
@@ -122,4 +122,4 @@ def test_walls_given_are_checked():
     with pytest.raises(ValueError, match="boolean array"):
         walled_world(walls.astype(int), ((0, 0), (2, 2)))
     with pytest.raises(ValueError, match="no free cell"):
-        object_world(jax.random.key(0)).state_of((-1, 0))
+        random_object_world(jax.random.key(0)).state_of((-1, 0))

@@ -9,7 +9,7 @@ from i2rl.inference.adversarial.learner import AdversarialTraining, adversarial,
 from i2rl.inference.adversarial.noise_injection import NoisyTraining, noisy_airl
 from i2rl.inference.adversarial.policy_optimisation import ppo
 from i2rl.inference.journal.journal import Journal, JournalError
-from i2rl.inference.sessions.session import run_sessions
+from i2rl.inference.sessions.running import run_sessions
 from i2rl.models.observation.recordings import Recording, RecordingError, recording
 
 SMALL = AdversarialTraining(rounds=3, updates=2, batch=32)

@@ -19,7 +19,7 @@ from i2rl.inference.adversarial.noise_injection import (
 from i2rl.inference.adversarial.policy_optimisation import ppo
 from i2rl.inference.adversarial.rollouts import begin
 from i2rl.inference.journal.journal import Journal
-from i2rl.inference.sessions.session import run_sessions
+from i2rl.inference.sessions.running import run_sessions
 from i2rl.models.networks.modules import MLP, ActionSpace, CategoricalPolicy, GaussianPolicy
 from i2rl.models.observation.recordings import recording
 

@@ -16,7 +16,7 @@ from i2rl.inference.adversarial.robust import (
 from i2rl.inference.completion.gaussian import gaussian_truth, jax_dynamics
 from i2rl.inference.completion.gibbs import GaussianGibbs
 from i2rl.inference.journal.journal import Journal, JournalError
-from i2rl.inference.sessions.session import run_sessions
+from i2rl.inference.sessions.running import run_sessions
 from i2rl.models.networks.environment import Environment
 from i2rl.models.networks.modules import ActionSpace, policy_network
 from i2rl.models.observation.recordings import GaussianSensor, Recording, ShiftSensor, distort, truths

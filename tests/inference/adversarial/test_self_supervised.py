@@ -21,7 +21,7 @@ from i2rl.inference.adversarial.self_supervised import (
 )
 from i2rl.inference.adversarial.snippets import Regression
 from i2rl.inference.journal.journal import Journal
-from i2rl.inference.sessions.session import run_sessions
+from i2rl.inference.sessions.running import run_sessions
 from i2rl.models.networks.environment import Environment
 from i2rl.models.networks.modules import ActionSpace
 from i2rl.models.observation.recordings import recording

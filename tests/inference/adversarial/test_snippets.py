@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 
 from i2rl.inference.adversarial.snippets import (
+    Packing,
     Ranked,
     Regression,
     Snippets,
     SSRRReward,
-    _Packing,
     draw_snippets,
     snippet_lengths,
     snippet_regression,
@@ -61,7 +61,7 @@ def sums(observations, batch):
 
 def test_packed_snippets_sum_to_what_a_loop_sums(batch):
     observations, snippets = batch
-    packed = _Packing.of(np.array([5, 9, 25, 31]))
+    packed = Packing.of(np.array([5, 9, 25, 31]))
     assert len(packed.slot) == 70
     predicted = packed.predicted(
         lambda x: jnp.sin(x).sum(-1), jnp.asarray(observations), snippets, jax.random.key(0)
@@ -71,7 +71,7 @@ def test_packed_snippets_sum_to_what_a_loop_sums(batch):
 
 def test_sums_from_some_of_the_states_are_right_on_average(batch):
     observations, snippets = batch
-    packed = _Packing.of(np.array([4, 4, 4, 4]))
+    packed = Packing.of(np.array([4, 4, 4, 4]))
     keys = jax.random.split(jax.random.key(1), 4000)
     drawn = np.asarray(
         jax.vmap(

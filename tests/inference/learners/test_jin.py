@@ -10,7 +10,8 @@ from i2rl.inference.learners.jin import (
     reward_correction,
     with_state_features,
 )
-from i2rl.inference.sessions.session import fleet, run_sessions
+from i2rl.inference.sessions.fleets import fleet
+from i2rl.inference.sessions.running import run_sessions
 from i2rl.models import (
     Demonstration,
     DemonstrationError,

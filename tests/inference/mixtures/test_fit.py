@@ -20,7 +20,7 @@ from i2rl.inference.mixtures.fit import (
     empty_mixture,
     nothing_kept,
 )
-from i2rl.inference.mixtures.search import _merge_once
+from i2rl.inference.mixtures.search import merge_once
 from i2rl.inference.programs.entropic import entropic_proportions
 from i2rl.inference.programs.maximum_entropy import count_information
 from i2rl.inference.programs.minmax import MinMaxProgram
@@ -30,7 +30,7 @@ from i2rl.models.process.planning import reachable_states, reward_of, soft_plan
 from i2rl.models.process.units import with_scaled_features
 
 WAYS, LENGTH = 3, 10
-climbed, merged = jax.jit(climb), jax.jit(_merge_once)
+climbed, merged = jax.jit(climb), jax.jit(merge_once)
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from scipy import integrate
 from scipy.special import gammaln, logsumexp
 
 from i2rl.analysis.benchmarks.statistics.mixture import Drawn, compare, invariant_statistics, tails
-from i2rl.inference.posteriors.gibbs import _move_concentration, gibbs_mixture_posterior
+from i2rl.inference.posteriors.gibbs import gibbs_mixture_posterior, move_concentration
 from i2rl.inference.posteriors.mixture import sample_mixture_posterior
 from i2rl.inference.posteriors.mixture_problem import label_invariant, log_partition
 from i2rl.models import Demonstration, DemonstrationError, TabularMDP, TrajectoryLaw, Visibility
@@ -313,7 +313,7 @@ def test_the_concentration_moves_towards_its_conditional():
     total, mean = (integrate.quad(lambda x, p=p: x**p * density(x), 0, 40)[0] for p in (0, 1))
     step = jax.jit(
         lambda key: jax.lax.scan(
-            lambda x, k: (_move_concentration(k, x, prior, ways, n),) * 2, 1.0, jax.random.split(key, 4000)
+            lambda x, k: (move_concentration(k, x, prior, ways, n),) * 2, 1.0, jax.random.split(key, 4000)
         )[1]
     )
     draws = np.stack([step(jax.random.key(seed)) for seed in (0, 1)])

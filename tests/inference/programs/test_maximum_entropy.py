@@ -18,8 +18,8 @@ from i2rl.inference.programs.dual import CountProgram, DualProgram
 from i2rl.inference.programs.maximum_entropy import (
     LinearObjective,
     WarmStart,
-    _expand,
     count_objective,
+    expand,
     exponentiated_gradient,
     fit_counts,
     quadratic_l1,
@@ -218,7 +218,7 @@ def test_gradient_and_hessian_are_those_of_the_dual():
         return target.start @ soft_values(mdp, w) - target.features @ w
 
     objective = LinearObjective(target.start, target.features)
-    expansion = _expand(mdp, objective, weights, soft_values(mdp, weights))
+    expansion = expand(mdp, objective, weights, soft_values(mdp, weights))
     np.testing.assert_allclose(expansion.gradient, jax.grad(dual)(weights), rtol=1e-8)
     np.testing.assert_allclose(expansion.hessian, jax.hessian(dual)(weights), rtol=1e-8)
     nudge = 1e-6 * jnp.eye(3)
@@ -233,7 +233,7 @@ def test_fisher_information_is_the_hessian_where_the_counts_are_the_policy_s_own
     def loss(w):
         return objective.state_weights @ soft_values(mdp, w) - objective.features @ w
 
-    expansion = _expand(mdp, objective, weights, soft_values(mdp, weights))
+    expansion = expand(mdp, objective, weights, soft_values(mdp, weights))
     np.testing.assert_allclose(expansion.hessian, jax.hessian(loss)(weights), rtol=1e-7)
     np.testing.assert_allclose(expansion.gradient, 0, atol=1e-8)
 
@@ -250,7 +250,7 @@ def test_the_quadratic_model_of_counts_is_convex_and_never_flatter_than_the_like
         def loss(w, objective=objective):
             return objective.state_weights @ soft_values(mdp, w) - objective.features @ w
 
-        model = _expand(mdp, objective, weights, soft_values(mdp, weights)).hessian
+        model = expand(mdp, objective, weights, soft_values(mdp, weights)).hessian
         exact = jax.hessian(loss)(weights)
         assert np.linalg.eigvalsh(model).min() >= -1e-10
         assert np.linalg.eigvalsh(model - exact).min() >= -1e-8

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import i2rl.models
-from i2rl.domains.labyrinth.process import labyrinth, read_bouts
+from i2rl.domains.labyrinth.process import mouse_labyrinth, read_bouts
 from i2rl.models import (
     Demonstration,
     DemonstrationError,
@@ -431,7 +431,7 @@ def test_what_is_no_list_of_lists_of_steps_is_refused(steps, message):
 
 def test_a_domain_is_no_mdp_but_has_one():
     with pytest.raises(TypeError, match="mdp must be a TabularMDP; got a Labyrinth; pass its mdp"):
-        Demonstration.from_steps([["hidden"]], labyrinth())
+        Demonstration.from_steps([["hidden"]], mouse_labyrinth())
 
 
 # -- writing ----------------------------------------------------------------------------------------------

@@ -14,7 +14,7 @@ from i2rl.analysis.command.app import app
 from i2rl.analysis.studies.label_bias import page as label_bias_report
 from i2rl.analysis.studies.label_bias import study as label_bias
 from i2rl.analysis.studies.label_bias.study import BOLTZMANN, MAXENT, OPTIMAL, Setting
-from i2rl.domains.object_world.process import object_world, walled_world, without_blocked_moves
+from i2rl.domains.object_world.process import random_object_world, walled_world, without_blocked_moves
 
 
 def _small_world():
@@ -94,7 +94,7 @@ def _in_every_world(mdps, weights, expert):
 
 
 def test_optimal_experts_earn_the_most_there_is():
-    worlds = [object_world(jax.random.key(i)) for i in range(_WORLDS)]
+    worlds = [random_object_world(jax.random.key(i)) for i in range(_WORLDS)]
     drawn = _in_every_world([world.mdp for world in worlds], worlds[0].weights, OPTIMAL)
     for i, world in enumerate(worlds):
         best = np.zeros(len(world.cells))

@@ -14,16 +14,13 @@ from typer.testing import CliRunner
 from i2rl.analysis.command.app import app
 from i2rl.analysis.drawing.style import LIGHT
 from i2rl.analysis.studies.labyrinth.figures import value_on_maze, values_by_node
+from i2rl.analysis.studies.labyrinth.page import print_tables, summary, tables, write
 from i2rl.analysis.studies.labyrinth.study import (
     bits_per_decision,
     predict_with_learner,
     predict_with_table,
     predict_with_tables,
-    print_tables,
     study,
-    summary,
-    tables,
-    write,
 )
 from i2rl.domains.labyrinth.process import (
     FIRST_END,
@@ -31,14 +28,14 @@ from i2rl.domains.labyrinth.process import (
     WATER_PORT,
     Bout,
     demonstration_of,
-    labyrinth,
+    mouse_labyrinth,
     parent_of,
     simulate_bouts,
 )
 from i2rl.models.process.planning import reward_of, soft_plan
 
 DISCOUNT = 0.6
-MAZE = labyrinth(DISCOUNT)
+MAZE = mouse_labyrinth(DISCOUNT)
 NOTHING = np.zeros(MAZE.mdp.n_states, bool)
 
 

@@ -26,7 +26,7 @@ from i2rl.analysis.studies.noisy.study import (
     taken_at_face_value,
 )
 from i2rl.domains.noisy.tasks import agreement_probabilities, demonstrate_noisy, noisy_sorting
-from i2rl.inference.sessions.session import Learner
+from i2rl.inference.sessions.learner import Learner
 from i2rl.models import Demonstration
 
 

@@ -35,7 +35,8 @@ from i2rl.inference.completion.transitions import (
     visited_transitions,
 )
 from i2rl.inference.journal.journal import Journal
-from i2rl.inference.sessions.session import Learner, run_sessions
+from i2rl.inference.sessions.learner import Learner
+from i2rl.inference.sessions.running import run_sessions
 from i2rl.models import Demonstration, DemonstrationError, Sensor, TabularMDP, Visibility, simulate, soft_plan
 from i2rl.models.observation.confusions import Confusions
 from i2rl.models.observation.demonstration import HIDDEN

@@ -1,0 +1,125 @@
+"""Parts of a session that alternates completion and program: what LME-I2RL and RIMEO share."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from ...models.laws.chain import Smoothed
+from ...models.observation.evidence import (
+    Imperfection,
+)
+from ...models.process.mdp import TabularMDP
+from ...models.process.planning import SoftPlan, reward_of, soft_plan
+from ..completion.smoothing import Evidence, blocked_posterior, gibbs_posterior, smooth_all
+from ..programs.constraints import FeatureTarget
+from ..programs.maximum_entropy import (
+    Solution,
+    WarmStart,
+    exponentiate_scaled,
+    fit_scaled_counts,
+    solve_scaled_dual,
+)
+from ..sessions.schedule import Schedule, program_slack, require_slack
+from ..sessions.statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
+
+
+class Method(NamedTuple):
+    """Choices that the parts of a session share."""
+
+    mdp: TabularMDP
+    sensor: Imperfection
+    statistic: Statistic
+    completion: Callable[[Array, TabularMDP, Float[Array, "S A"], Evidence], Smoothed]
+    slack: Schedule
+    ridge: float
+
+    def plan(self, weights: Float[Array, " K"], values: Float[Array, " S"]) -> SoftPlan:
+        """Plan softly under weights, from earlier values."""
+        return soft_plan(self.mdp, reward_of(self.mdp, weights), values)
+
+    def e_step(self, key: Array, plan: SoftPlan, evidence: Evidence, seen: Bool[Array, "n L"]) -> Any:
+        """Complete a session's trajectories under a plan."""
+        posterior = self.completion(key, self.mdp, plan.log_policy, evidence)
+        return complete(self.mdp, posterior, evidence.live, seen)
+
+    def working(self, kept: Any, key: Array, plan: SoftPlan, evidence: Evidence, seen: Array) -> tuple:
+        """What the M-step fits, and the session's exact log-likelihood under ``plan``.
+
+        It fits the carried statistic and the current session, completed under ``plan``.
+        """
+        completed = self.e_step(key, plan, evidence, seen)
+        working = blend(kept, self.statistic.of_session(self.mdp, plan, completed))
+        return working, jnp.sum(completed.expectations.log_likelihood)
+
+    def gradient(self, weights: Float[Array, " K"], values: Float[Array, " S"], working: Any) -> Array:
+        """Norm of the log-likelihood's gradient; ``|phi_hat - E[phi]|`` with the ``features`` statistic."""
+
+        def likelihood(w: Float[Array, " K"]) -> Float[Array, ""]:
+            return self.statistic.log_likelihood(self.mdp, w, self.plan(w, values).values, working)
+
+        return jnp.linalg.norm(jax.grad(likelihood)(weights))
+
+    def penalties(self, statistic: Any, session: Int[Array, ""]) -> tuple:
+        """Slack of the program in a session, and the prior's precision per trajectory."""
+        slack = program_slack(self.slack, session, self.statistic.slack(self.mdp, 1.0))
+        return slack, self.ridge / jnp.maximum(statistic.size, 1.0)
+
+
+def checked_method(
+    mdp: TabularMDP,
+    sensor: Imperfection,
+    statistic: str,
+    completion: str,
+    slack: Schedule,
+    ridge: float,
+    draws: int,
+) -> Method:
+    """Check the choices of a method, and gather them."""
+    samplers = {"blocked": blocked_posterior, "gibbs": gibbs_posterior}
+    if statistic not in STATISTICS:
+        raise ValueError(f"statistic must be one of {', '.join(STATISTICS)}, got {statistic!r}")
+    if completion != "exact" and completion not in samplers:
+        raise ValueError(f"completion must be exact, blocked or gibbs, got {completion!r}")
+    if completion != "exact" and draws < 1:
+        raise ValueError(f"a sampled completion needs at least one draw, got {draws}")
+    require_slack(slack)
+    if not ridge >= 0:
+        raise ValueError(f"ridge must not be negative, got {ridge}")
+
+    def exact(key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Smoothed:
+        del key
+        return smooth_all(mdp, log_policy, evidence)
+
+    complete_with = exact if completion == "exact" else partial(samplers[completion], draws=draws)
+    return Method(mdp, sensor, STATISTICS[statistic], complete_with, slack, ridge)
+
+
+def random_weights(key: Array, mdp: TabularMDP) -> Float[Array, " K"]:
+    """``theta^0_k ~ uniform(0, 1)``, scaled (Algorithm 1, line 2)."""
+    return jax.random.uniform(key, (mdp.n_features,), float)
+
+
+def newton(mdp: TabularMDP, statistic: Any, slack: Array, ridge: Array, start: WarmStart) -> Solution:
+    """Solve the program of a statistic by Newton's method."""
+    if isinstance(statistic, FeatureStatistic):
+        target = FeatureTarget(statistic.features, statistic.start)
+        return solve_scaled_dual(mdp, target, slack, ridge, start)
+    return fit_scaled_counts(mdp, statistic.counts, slack, ridge, start)
+
+
+def exponentiated(mdp: TabularMDP, statistic: Any, slack: Array, ridge: Array, start: WarmStart) -> Solution:
+    """Solve the program of features by exponentiated gradient, as Algorithm 1 prints it."""
+    del ridge  # the printed update has no prior
+    target = FeatureTarget(statistic.features, statistic.start)
+    return exponentiate_scaled(mdp, target, slack * (1 - mdp.discount), start=start.weights)
+
+
+def relative_change(old: Float[Array, " K"], new: Float[Array, " K"]) -> Float[Array, ""]:
+    """Return the largest change of a weight, relative to the largest weight."""
+    return jnp.max(jnp.abs(new - old)) / (1e-3 + jnp.max(jnp.abs(new)))

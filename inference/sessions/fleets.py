@@ -1,0 +1,85 @@
+"""One learner on many independent streams at once."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array
+
+from ...models.inputs.arguments import as_key
+from ...models.observation.demonstration import Demonstration
+from .learner import Learner, Report
+
+
+class Fleet(NamedTuple):
+    """One learner on many independent streams: states and demonstrations with a leading axis."""
+
+    init: Callable[[Array, int], Any]
+    update: Callable[[Any, Demonstration], tuple[Any, Report]]
+
+
+def fleet(learner: Learner) -> Fleet:
+    """Map a learner over independent streams in one compiled program.
+
+    ``init(key, streams)`` and ``update(states, demonstrations)``, the arrays of a demonstration being
+    ``[streams, n, L]``. Raises ``ValueError`` for a learner whose solver runs outside JAX. Observations
+    are not checked: an impossible one shows as a demonstration log-likelihood of minus infinity, and leaves
+    its learner's state as it was. On a CPU the streams take turns: lanes of a mapped loop would all wait for
+    the slowest of them, at every level of nested loops.
+    """
+    if learner.session is None:
+        raise ValueError(
+            f"{learner.name} solves its programs outside JAX, so it cannot be mapped over streams"
+        )
+    session = learner.session
+
+    @jax.jit
+    def update(states: Any, demonstrations: Demonstration) -> tuple[Any, Report]:
+        return lax.platform_dependent(
+            states,
+            jax.tree.map(jnp.asarray, demonstrations),
+            cpu=lambda *streams: lax.map(lambda stream: session(*stream), streams),
+            default=jax.vmap(session),
+        )
+
+    init = jax.vmap(learner.init)
+    return Fleet(lambda key, streams: init(jax.random.split(as_key(key), streams)), update)
+
+
+def run_streams(
+    learner: Learner,
+    key: Array,
+    demonstrations: Demonstration,
+    keep: Callable[[Any, Report], Any] | None = None,
+) -> tuple[Any, Any]:
+    """Run a learner over whole streams in one compiled program, for studies of many repetitions.
+
+    ``demonstrations`` holds arrays ``[R, T, n, L]``: ``R`` streams of ``T`` sessions. Returns the final
+    states ``[R]`` and what ``keep(state, report)``, a pure function called after each session (the report
+    by default), gave: arrays ``[R, T]``. Streams run one after the other. Observations are not checked,
+    as in a fleet; of the keys, stream ``i`` gets that which stream ``i`` of a fleet gets.
+    Raises ``ValueError`` for a learner whose solver runs outside JAX, or arrays of another rank.
+    """
+    if learner.session is None:
+        raise ValueError(f"{learner.name} solves its programs outside JAX, so it cannot run compiled streams")
+    shape = np.shape(demonstrations.kind)
+    if len(shape) != 4:
+        raise ValueError(f"streams need arrays [streams, sessions, trajectories, steps], got {list(shape)}")
+    session, init = learner.session, learner.init
+
+    def one(inputs: tuple) -> Any:
+        def step(state: Any, demonstration: Demonstration) -> tuple:
+            state, report = session(state, demonstration)
+            return state, report if keep is None else keep(state, report)
+
+        start, stream = inputs
+        return lax.scan(step, init(start), stream)
+
+    inputs = (jax.random.split(as_key(key), shape[0]), jax.tree.map(jnp.asarray, demonstrations))
+    return jax.jit(partial(lax.map, one))(inputs)

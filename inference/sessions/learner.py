@@ -1,0 +1,107 @@
+"""The learner protocol (chapter 3): a learner is a pair of functions on an explicit state.
+
+``init(key)`` gives the state before the first session; ``update(state, demonstration)`` runs one session
+(Definition 4) and returns the new state and a report. The state holds what Definition 7 allows, the reward
+estimate and the sufficient statistic (with warm starts for the solvers), and nothing of earlier
+demonstrations.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Callable, Mapping
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+from jaxtyping import Array, Float
+
+from ...models.observation.demonstration import Demonstration
+from ...models.process.mdp import TabularMDP
+
+AnyReport = TypeVar("AnyReport", bound=tuple)
+
+
+class Report(NamedTuple):
+    """What a session did: plain numbers (from a fleet, arrays with one entry a stream).
+
+    Fields
+    ------
+    session : int
+        Its number, from 1.
+    log_likelihood : float
+        ``LL(theta^i | X_i, statistic)`` in nats per trajectory: what the statistic holds once the session is
+        in it, under the new weights. The share of the dynamics, which no weights change, is left out, so
+        that sessions compare.
+    demonstration_log_likelihood : float
+        Exact log-likelihood (nats, hidden steps summed out, dynamics included) of this session's
+        demonstration alone.
+    gradient : float
+        Norm of the log-likelihood's gradient in scaled weights (:mod:`~i2rl.models.process.units`) at the
+        weights the session began with: how far this session's data disagree with them. ``|phi_hat - E[phi]|``
+        of scaled features (line 15 of Algorithm 1) with the features statistic.
+    iterations : int
+        E- and M-steps.
+    solver_iterations : int
+        Iterations of the programs' solver, summed over the M-steps.
+    converged : bool
+        Whether the session's last program met its tolerance. True for a method that solves none.
+    seconds : float
+        Wall-clock time of the session.
+    weights : float ``[K]``
+        The new reward weights.
+    """
+
+    session: int
+    log_likelihood: float
+    demonstration_log_likelihood: float
+    gradient: float
+    iterations: int
+    solver_iterations: int
+    converged: bool
+    seconds: float
+    weights: Float[np.ndarray, " K"]
+
+    def in_plain_numbers(self, seconds: float) -> Report:
+        """The report of a compiled session with Python's numbers and NumPy's arrays, and the time it took."""
+        return in_plain_numbers(self, seconds)
+
+
+def in_plain_numbers(report: AnyReport, seconds: float) -> AnyReport:
+    """A learner's own kind of report in the same form: any named tuple with a field ``seconds``."""
+    arrays = {name: np.asarray(value) for name, value in report._asdict().items()}  # type: ignore[attr-defined]
+    values: dict[str, Any] = {name: x if x.ndim else x.item() for name, x in arrays.items()}
+    return type(report)(**values | {"seconds": seconds})
+
+
+class Learner(NamedTuple):
+    """An online learner: configuration, and two functions on an explicit state.
+
+    ``session`` is the pure, compiled core of ``update`` (state and padded demonstration in, state and
+    report out) that :func:`fleet` maps over many streams; None where a solver runs outside JAX.
+    """
+
+    name: str
+    mdp: TabularMDP
+    configuration: Mapping[str, Any]
+    init: Callable[[Array], Any]
+    update: Callable[[Any, Demonstration], tuple[Any, Report]]
+    session: Callable[[Any, Demonstration], tuple[Any, Report]] | None = None
+    log_likelihood: Callable[[Any, Float[Array, " K"]], float] | None = None
+
+    @property
+    def signature(self) -> str:
+        """Digest of the MDP, the method and its configuration: what a journal must have been made for."""
+        content = json.dumps(
+            [self.mdp.fingerprint(), self.name, dict(self.configuration)], sort_keys=True, default=str
+        )
+        return hashlib.sha256(content.encode()).hexdigest()
+
+
+def digest_of(sensor: Any) -> str:
+    """Digest the arrays of a sensor, to identify it in a configuration."""
+    digest = hashlib.sha256(type(sensor).__name__.encode())
+    for leaf in jax.tree.leaves(sensor):
+        digest.update(np.ascontiguousarray(leaf).tobytes())
+    return digest.hexdigest()[:16]

@@ -1,0 +1,124 @@
+"""Stopping criteria: functions of the reports so far."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple, Protocol
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import lax
+from jaxtyping import Array, Float, Int
+
+from ...models.process.mdp import TabularMDP
+from ...models.process.planning import deterministic_policy, hard_plan, policy_values, reward_of
+from .learner import Report
+
+
+class StoppingCriterion(Protocol):
+    """Decides from the reports so far whether the sessions should end."""
+
+    def __call__(self, reports: Sequence[Report]) -> bool:
+        """Whether to stop after the last report."""
+
+
+class LikelihoodChange(NamedTuple):
+    """Criterion 1 (Definition 5): the session's log-likelihood changed by at most ``rho``."""
+
+    rho: float
+
+    def __call__(self, reports: Sequence[Report]) -> bool:
+        """Whether to stop after the last report."""
+        if len(reports) < 2:
+            return False
+        return abs(reports[-1].log_likelihood - reports[-2].log_likelihood) <= self.rho
+
+
+class LearningErrorChange:
+    """Criterion 2 (Definition 6): the inverse learning error fell by at most ``rho``.
+
+    For evaluation, where the expert's reward ``weights [K]`` are known; takes them and the MDP.
+    """
+
+    def __init__(self, rho: float, mdp: TabularMDP, weights: Float[np.ndarray, " K"]) -> None:
+        self.rho = rho
+        reward = reward_of(mdp, jnp.asarray(weights))
+        best = hard_plan(mdp, reward).values
+
+        def error(learned: Float[Array, " K"]) -> Float[Array, ""]:
+            policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, learned)).optimal)
+            return jnp.sum(jnp.abs(best - policy_values(mdp, policy, reward)))
+
+        self._error = jax.jit(error)
+
+    def __call__(self, reports: Sequence[Report]) -> bool:
+        """Whether to stop after the last report."""
+        if len(reports) < 2:
+            return False
+        before, after = (float(self._error(_one_reward(r))) for r in reports[-2:])
+        return before - after <= self.rho
+
+
+class MovingWindow:
+    """Against early stopping (chapter 4): the standard deviation over the last ``width`` sessions is small.
+
+    ``of`` is the field of the report that must settle within ``tolerance``: ``log_likelihood`` or
+    ``gradient``. What protects is the width: where nothing is seen everything stands still, so it should
+    exceed the longest stretch of sessions without a sighting. Raises ``ValueError`` for another field or a
+    width below 2.
+    """
+
+    def __init__(self, width: int, tolerance: float, of: str = "log_likelihood") -> None:
+        if of not in ("log_likelihood", "gradient"):
+            raise ValueError(f"a moving window is of log_likelihood or gradient, got {of!r}")
+        if width < 2:
+            raise ValueError(f"a moving window needs at least 2 sessions, got {width}")
+        self.width, self.tolerance, self.of = width, tolerance, of
+
+    def __call__(self, reports: Sequence[Report]) -> bool:
+        """Whether to stop after the last report."""
+        if len(reports) < self.width:
+            return False
+        return float(np.std([getattr(r, self.of) for r in reports[-self.width :]])) <= self.tolerance
+
+
+class PolicyWindow:
+    """The learned behaviour has settled: the greedy policies of the last ``width`` sessions agree.
+
+    Each may differ from the current one in at most the share ``tolerance`` of all states. Needs no expert,
+    has no unit that depends on the data, and looks at what the learner is for: rewards may go on moving
+    where no decision depends on them. Raises ``ValueError`` for a width below 2 or a share outside [0, 1].
+    """
+
+    def __init__(self, width: int, tolerance: float, mdp: TabularMDP) -> None:
+        if width < 2:
+            raise ValueError(f"a window of policies needs at least 2 sessions, got {width}")
+        if not 0 <= tolerance <= 1:
+            raise ValueError(f"the tolerance is a share of the states in [0, 1], got {tolerance}")
+        self.width, self.tolerance = width, tolerance
+
+        def actions(weights: Float[Array, "w K"]) -> Int[Array, "w S"]:
+            def one(w: Float[Array, " K"]) -> Int[Array, " S"]:
+                return jnp.argmax(deterministic_policy(hard_plan(mdp, reward_of(mdp, w)).optimal), axis=1)
+
+            return lax.map(one, weights)
+
+        self._actions = jax.jit(actions)
+
+    def __call__(self, reports: Sequence[Report]) -> bool:
+        """Whether to stop after the last report."""
+        if len(reports) < self.width:
+            return False
+        actions = np.asarray(self._actions(np.stack([_one_reward(r) for r in reports[-self.width :]])))
+        return float((actions != actions[-1]).mean(axis=1).max()) <= self.tolerance
+
+
+def _one_reward(report: Report) -> Float[np.ndarray, " K"]:
+    weights = np.asarray(report.weights)
+    if weights.ndim != 1:
+        raise ValueError(
+            f"this criterion compares one reward with the next; the learner has {len(weights)} at a time: "
+            "use LikelihoodChange or MovingWindow"
+        )
+    return weights
