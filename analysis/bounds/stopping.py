@@ -60,7 +60,7 @@ def likelihood_change(log_likelihood: Float[np.ndarray, "R T"], rho: float) -> I
 
 
 def learning_error_change(error: Float[np.ndarray, "R T"], rho: float) -> Int[np.ndarray, " R"]:
-    """Criterion 2, :class:`~i2rl.inference.LearningErrorChange`: as above, of inverse learning errors."""
+    """Apply criterion 2, ``LearningErrorChange``, to inverse learning errors."""
     return _first(-np.diff(error, axis=1) <= rho, 2)
 
 

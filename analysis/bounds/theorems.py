@@ -274,7 +274,7 @@ class ObservedBound(NamedTuple):
 
     ``target [K]`` and ``slack [K]`` are what the maximum-entropy program has to be given for ``bound`` to
     hold of its solution. Both are in units of ``phi_hat``: the program takes ``slack`` divided by
-    :func:`~i2rl.models.feature_scale`.
+    :func:`~i2rl.models.process.units.feature_scale`.
     """
 
     target: Float[np.ndarray, " K"]
@@ -338,9 +338,9 @@ def observed_size(deviations: Float[np.ndarray, " K"], error: float, confidence:
     """Trajectories with which :func:`observed_bound` is about ``2 K error / (1 - gamma)`` nats.
 
     ``deviations [K]`` are the standard deviations of the features' discounted averages ``(1 - gamma) f_k``
-    (:func:`~i2rl.models.feature_deviations` times ``1 - gamma``, or a guess). A plan: what is guaranteed is
-    the bound computed once the trajectories are there. Raises ``ValueError`` for a confidence outside
-    (0, 1), an error that is not positive, or deviations outside [0, 1/2].
+    (:func:`~i2rl.models.process.planning.feature_deviations` times ``1 - gamma``, or a guess). A plan: what
+    is guaranteed is the bound computed once the trajectories are there. Raises ``ValueError`` for a
+    confidence outside (0, 1), an error that is not positive, or deviations outside [0, 1/2].
     """
     spread = np.atleast_1d(np.asarray(deviations, float))
     if spread.ndim != 1 or not ((spread >= 0) & (spread <= 0.5)).all():

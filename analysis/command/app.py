@@ -170,7 +170,7 @@ def run_patrol(
     from ..studies.patrol import study as patrol_study
 
     with _reported_errors(), _progress(as_json) as advance:
-        study = patrol_study.study(
+        study = patrol_study.patrol_study(
             instance, observability, sessions=sessions, trials=trials, runs=runs, seed=seed,
             methods=None if method is Method.all else (method.value,), advance=advance,
         )  # fmt: skip
@@ -199,7 +199,7 @@ def run_labyrinth(
     with _reported_errors(), _progress(as_json) as advance:
         with recording.open("rb") as lines:
             bouts = list(read_bouts(lines, recording.name))
-        study = labyrinth.study(
+        study = labyrinth.labyrinth_study(
             bouts, recording=recording.stem, hide_left=hide_left,
             discount=labyrinth.DISCOUNT if discount is None else discount,
             ridge=labyrinth.RIDGE if ridge is None else ridge,
@@ -232,7 +232,7 @@ def bounds(
     as_json: Json = False,
 ) -> None:
     """Say how many demonstrations are enough: by the theorem, by tighter bounds, and what is assumed."""
-    from ..bounds import answer as bounds_answer
+    from ..bounds import sample_sizes as bounds_answer
 
     with _reported_errors():
         answer = bounds_answer.answer(
@@ -257,7 +257,9 @@ def run_methods(
     from ..studies.methods import study as online_methods
 
     with _reported_errors(), _progress(as_json) as advance:
-        study = online_methods.study(instance, sessions=sessions, runs=runs, seed=seed, advance=advance)
+        study = online_methods.methods_study(
+            instance, sessions=sessions, runs=runs, seed=seed, advance=advance
+        )
         online_methods.write(study, report)
     _tell(online_methods, study, report, as_json)
 
@@ -276,7 +278,7 @@ def run_label_bias(
     from ..studies.label_bias import study as label_bias
 
     with _reported_errors(), _progress(as_json) as advance:
-        study = label_bias.study(worlds, trajectories, walls=walls, seed=seed, advance=advance)
+        study = label_bias.label_bias_study(worlds, trajectories, walls=walls, seed=seed, advance=advance)
         label_bias_report.write(study, report)
     _tell(label_bias_report, study, report, as_json)
 
@@ -309,7 +311,7 @@ def run_sorting(
     from ..studies.sorting import study as sorting_study
 
     with _reported_errors(), _progress(as_json) as advance:
-        study = sorting_study.study(
+        study = sorting_study.sorting_study(
             tasks, sorting_study.counts_of(tasks, trajectories), runs=runs, seed=seed, sessions=sessions,
             ways=ways, steps=steps, belts=belts, advance=advance,
             methods=None if method is MultiTask.all else (method.value,),
@@ -332,14 +334,14 @@ def run_robust_airl(
     as_json: Json = False,
 ) -> None:
     """Learn rewards as networks from noisy reports: AIRL, robust-AIRL and SSRR, judged by the true reward."""
-    from ..studies.adversarial import answer as adversarial_answer
+    from ..studies.adversarial import running as robust_airl
 
     with _reported_errors(), _progress(as_json) as advance:
-        results = adversarial_answer.answer(
+        results = robust_airl.answer(
             domain.value, seeds, sessions, noise, workers=workers, kept=kept, advance=advance
         )
-        adversarial_answer.write(results, report)
-    _tell(adversarial_answer, results, report, as_json)
+        robust_airl.write(results, report)
+    _tell(robust_airl, results, report, as_json)
 
 
 NoisyRuns = Annotated[int, _count("Independent repetitions.")]
@@ -391,7 +393,7 @@ def _run_noisy(
     from ..studies.noisy import study as noisy_study
 
     with _reported_errors(), _progress(as_json) as advance:
-        study = noisy_study.study(
+        study = noisy_study.noisy_study(
             task, runs=runs, sessions=sessions, starts=starts.value, seed=seed, advance=advance, **options
         )
         noisy_report.write(study, report)

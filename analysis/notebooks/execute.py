@@ -37,7 +37,7 @@ def notebooks() -> list[Path]:
     return sorted(FOLDER.glob("*.ipynb"))
 
 
-def execute(
+def execute_notebook(
     path: Path | str, parameters: Mapping[str, Any] | None = None, *, timeout: int = 600
 ) -> NotebookNode:
     """The notebook with its outputs, executed by this interpreter in an empty folder; no file is written.
@@ -131,7 +131,7 @@ def main(paths: Sequence[str] = ()) -> None:
     """Execute notebooks in place (all of the package's by default) and say how long each took."""
     for path in map(Path, paths or notebooks()):
         began = time.perf_counter()
-        notebook = tidy(execute(path))
+        notebook = tidy(execute_notebook(path))
         seconds = time.perf_counter() - began
         nbformat.write(notebook, path)
         print(f"{path.name}: {seconds:.0f} s, {path.stat().st_size / 1000:.0f} kB")

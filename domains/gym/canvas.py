@@ -90,7 +90,9 @@ def caption(mdp: TabularMDP, shown: Frame, columns: int = 10_000) -> str:
     return f"{fill(last, columns)}\n{fill(mdp.state_names[shown.state], columns)}"
 
 
-def canvas(left: float, right: float, bottom: float, top: float, pixels: float, *, caption: float) -> Axes:
+def new_canvas(
+    left: float, right: float, bottom: float, top: float, pixels: float, *, caption: float
+) -> Axes:
     """Axes that fill a figure, so many pixels a unit, with so many units for the caption below ``bottom``."""
     down = caption if top > bottom else -caption
     width, height = abs(right - left), abs(top - bottom) + caption
@@ -132,6 +134,6 @@ def number_cells(axes: Axes, rows: range, columns: range, gap: float = 0.62) -> 
 
 def text_scene(mdp: TabularMDP) -> Scene:
     """The scene of a process nobody drew: what is done and where it leads, in words."""
-    axes = canvas(0, 10, 0, 1, 40, caption=2)
+    axes = new_canvas(0, 10, 0, 1, 40, caption=2)
     axes.text(0.2, 0.6, "state and last action", color=MUTED, fontsize=9, va="center")
     return Scene(axes, mdp, (), lambda state: None, 60)

@@ -11,7 +11,7 @@ from ..gym.canvas import (
     WALL,
     WATER,
     Scene,
-    canvas,
+    new_canvas,
 )
 from .process import HOME, LEVELS, N_NODES, WATER_PORT, Labyrinth, parent_of
 
@@ -37,7 +37,7 @@ def _ahead(places: np.ndarray, node: int) -> np.ndarray:
 def labyrinth_scene(labyrinth: Labyrinth) -> Scene:
     """The maze with its water port and the mouse, nose where it is going."""
     places = maze_layout()
-    axes = canvas(-15.5, 15.5, -17.5, 15.5, 16, caption=3)
+    axes = new_canvas(-15.5, 15.5, -17.5, 15.5, 16, caption=3)
     axes.add_patch(Rectangle((-15.5, -17.5), 31, 33, facecolor=WALL, zorder=0))
     for node in range(N_NODES):
         x, y = zip(places[node], places[parent_of(node)], strict=True)

@@ -13,9 +13,9 @@ from ..gym.canvas import (
     WALL,
     WATER,
     Scene,
-    canvas,
     draw_cell,
     draw_key,
+    new_canvas,
     number_cells,
 )
 from .process import ObjectWorld
@@ -25,7 +25,7 @@ def object_world_scene(world: ObjectWorld) -> Scene:
     """The grid with its walls, the two objects as stars, and the agent."""
     rows, columns = world.walls.shape
     pixels = max(16, 420 / max(rows, columns))
-    axes = canvas(-1.3, columns, rows, -1.3 - 18 / pixels, pixels, caption=48 / pixels)
+    axes = new_canvas(-1.3, columns, rows, -1.3 - 18 / pixels, pixels, caption=48 / pixels)
     draw_key(
         axes,
         [("o", AGENT, "agent"), ("*", GOAL, "first object"), ("*", WATER, "second"), ("s", WALL, "wall")],

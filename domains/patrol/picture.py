@@ -15,9 +15,9 @@ from ..gym.canvas import (
     INK,
     WALL,
     Scene,
-    canvas,
     draw_cell,
     draw_key,
+    new_canvas,
     number_cells,
 )
 from .process import Patrol, State
@@ -51,7 +51,7 @@ def draw_floor(
     """
     (low, left), (high, right) = np.min(cells, axis=0), np.max(cells, axis=0)
     pixels = max(24, min(44, 480 / (high - low + 1)))
-    axes = canvas(
+    axes = new_canvas(
         left - 1.6, right + 1.1, high + 1.1, low - 1.5 - 18 * lines / pixels, pixels, caption=48 / pixels
     )
     size = (right - left + 1.7, high - low + 1.7)

@@ -31,7 +31,7 @@ from ...models.inputs.text import parsed_json, shortened
 from ...models.networks.modules import Policy, policy_network
 from ...models.observation.recordings import Recording, recording
 from .control import mountain_car
-from .locomotion import ROBOTS, locomotion
+from .walkers import ROBOTS, locomotion
 
 EXPERTS = (*ROBOTS, "mountain-car")
 FOLDER = Path(str(files(__package__))) / "recordings"

@@ -1,7 +1,7 @@
 """Recordings of somebody sorting onions, as files: reading those that were released, and writing our own.
 
 One pair of files a recording, comma-separated without a header. ``states_N.csv`` has 29 columns as in
-:mod:`i2rl.domains.robots.onion_reaching`; ``actions_N.csv`` has 3, the wrist's displacement in metres, so
+:mod:`i2rl.domains.robots.reaching`; ``actions_N.csv`` has 3, the wrist's displacement in metres, so
 that ``wrist[t + 1] - wrist[t]`` is ``action[t]``. Every state has an action, the last of which leads nowhere.
 """
 
@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from ...models.inputs.text import shortened
 from ...models.observation.recordings import Recording, RecordingError, recording
-from .onion_reaching import BLEMISHED, GONE, ONIONS, SIZE, STRIDE, UNBLEMISHED
+from .reaching import BLEMISHED, GONE, ONIONS, SIZE, STRIDE, UNBLEMISHED
 from .simulation import Trajectories
 
 _DECIMALS = 2

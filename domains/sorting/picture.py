@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Arc, Circle, Ellipse, FancyBboxPatch, Polygon, Rectangle
 
-from ..gym.canvas import FLOOR, INK, MUTED, PAGE, WALL, Scene, canvas
+from ..gym.canvas import FLOOR, INK, MUTED, PAGE, WALL, Scene, new_canvas
 from .process import (
     AT_BIN,
     AT_CONVEYOR,
@@ -47,7 +47,7 @@ _LIST = {
 
 def sorting_scene(sorting: Sorting) -> Scene:
     """The conveyor, the eyes, the bin, the claimed onion coloured by what is thought of it, and the hand."""
-    axes = canvas(0, 11.6, 0, 7.2, 46, caption=1.1)
+    axes = new_canvas(0, 11.6, 0, 7.2, 46, caption=1.1)
     _draw_table(axes)
     onion = Ellipse((0, 0), 0.92, 0.84, edgecolor=INK, linewidth=1.4, zorder=6)
     shoot = Polygon(np.zeros((3, 2)), facecolor="#6b8e4e", edgecolor=INK, linewidth=0.8, zorder=5)

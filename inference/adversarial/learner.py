@@ -22,8 +22,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ...extras import required
 from ...models.inputs.arguments import as_key
-from ...models.inputs.extras import required
 from ...models.networks.modules import DTYPE, ActionSpace, Policy, ShapedReward
 from ...models.observation.recordings import Recording, require_recording
 from ..sessions.learner import Learner

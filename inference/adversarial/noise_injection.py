@@ -26,8 +26,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
+from ...extras import required
 from ...models.inputs.arguments import as_key
-from ...models.inputs.extras import required
 from ...models.networks.environment import Environment, HostEnvironment, Rollout
 from ...models.networks.modules import DTYPE, MLP, ActionSpace, Policy, ShapedReward
 from ...models.observation.recordings import Recording

@@ -28,7 +28,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from ...models.inputs.extras import required
+from ...extras import required
 from ...models.networks.environment import Environment, Rollout
 from ...models.networks.modules import DTYPE, MLP, CategoricalPolicy, GaussianPolicy, Policy, RunningNorm
 from .rollouts import Episodes, Running, Task, begin, finished_returns, play, roll_out

@@ -15,7 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
-from ...models.inputs.extras import required
+from ...extras import required
 from ...models.networks.modules import DTYPE, MLP, RunningNorm
 
 if TYPE_CHECKING:

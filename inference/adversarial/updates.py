@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ...models.inputs.extras import required
+from ...extras import required
 from ...models.networks.modules import Policy, ShapedReward
 from .discriminator import ExpertTransitions, Losses, Transitions
 

@@ -43,7 +43,7 @@ from ..mixtures.fit import (
     log_policies,
     nothing_kept,
 )
-from ..mixtures.search import Search, search
+from ..mixtures.merging import Search, search
 from ..sessions.learner import Learner, digest_of, in_plain_numbers
 from ..sessions.scaling import on_scaled_features
 

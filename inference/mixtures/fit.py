@@ -17,7 +17,8 @@ Features are scaled (:mod:`~i2rl.models.process.units`), so penalties are of sca
 flips a coin once and then sticks to it from two sorters who know what they want: the first costs ``log 2``
 nats of indecision, the second ``log 2`` nats to say which sorter it was. Mixtures of rewards are about people
 who know what they want, so the information of who did what is charged at less than its price (a point further
-along the same rate-distortion curve). :mod:`~i2rl.inference.mixtures.search` decides how many ways there are.
+along the same rate-distortion curve). :mod:`~i2rl.inference.mixtures.merging` decides how many ways there
+are.
 """
 
 from __future__ import annotations

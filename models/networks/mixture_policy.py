@@ -8,7 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from ..inputs.extras import required
+from ...extras import required
 from .modules import DTYPE, GaussianPolicy
 
 if TYPE_CHECKING:

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
-from ..inputs.extras import required
+from ...extras import required
 
 if TYPE_CHECKING:
     import equinox as eqx

@@ -17,7 +17,7 @@ import jax
 import numpy as np
 
 from ....domains.robots.experts import load_expert
-from ....domains.robots.onion_reaching import demonstrate_onions
+from ....domains.robots.reaching import demonstrate_onions
 from ....inference.adversarial.discriminator import Transitions, airl_discriminator
 from ....inference.adversarial.learner import AdversarialTraining, discriminator_objective
 from ....inference.adversarial.robust import as_expert

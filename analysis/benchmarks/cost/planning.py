@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ....models import TabularMDP, feature_expectations, reward_of, soft_plan
-from ....models.process.planning import soft_backup
+from ....models.process.mdp import TabularMDP
+from ....models.process.planning import feature_expectations, reward_of, soft_backup, soft_plan
 
 SIZES = (124, 1024, 10_000, 100_000, 1_000_000)
 DISCOUNTS = (0.95, 0.99)

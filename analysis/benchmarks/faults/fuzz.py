@@ -37,8 +37,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ....domains.labyrinth.process import HOME, destination, read_bouts
-from ....domains.robots.onion_reaching import SIZE
 from ....domains.robots.onion_recordings import read_onion_recordings
+from ....domains.robots.reaching import SIZE
 from ....models.inputs.archives import StorageError
 from ....models.observation.demonstration import (
     DEFAULT_LIMITS,

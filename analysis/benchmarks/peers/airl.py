@@ -21,7 +21,7 @@ import jax
 import numpy as np
 
 from ....domains.robots.control import cart_pole
-from ....domains.robots.locomotion import locomotion
+from ....domains.robots.walkers import locomotion
 from ....inference.adversarial.discriminator import airl_discriminator
 from ....inference.adversarial.learner import AdversarialTraining, adversarial
 from ....inference.adversarial.policy_optimisation import PPO, ppo

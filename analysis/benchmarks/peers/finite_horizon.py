@@ -113,7 +113,8 @@ def serve() -> None:
     import jax.numpy as jnp
 
     from ....inference.programs.finite_horizon import fit_state_rewards, state_reward
-    from ....models import TabularMDP, finite_soft_plan
+    from ....models.process.mdp import TabularMDP
+    from ....models.process.planning import finite_soft_plan
     from ....version import __version__
 
     plan = jax.jit(finite_soft_plan, static_argnames="horizon")

@@ -88,7 +88,7 @@ def serve() -> None:
     import jax
 
     from ....domains.robots.control import cart_pole
-    from ....domains.robots.locomotion import locomotion
+    from ....domains.robots.walkers import locomotion
     from ....inference.adversarial.policy_optimisation import ppo
     from ....inference.adversarial.rollouts import Task
     from ....version import __version__

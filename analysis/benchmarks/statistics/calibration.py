@@ -27,9 +27,9 @@ from rich.table import Table
 from scipy import stats
 
 from ....inference.posteriors.weights import Problem, complete, nuts_chain, pointwise_log_likelihood
-from ....models import TabularMDP, Visibility
 from ....models.laws.occlusion import weights_prior
-from ....models.observation.evidence import observe
+from ....models.observation.evidence import Visibility, observe
+from ....models.process.mdp import TabularMDP
 from ....models.process.planning import reward_of, simulate, soft_plan
 
 

@@ -34,8 +34,10 @@ from scipy import stats
 from ....inference.posteriors.gibbs import gibbs_mixture_posterior
 from ....inference.posteriors.mixture import sample_mixture_posterior
 from ....inference.posteriors.mixture_problem import label_invariant, pose, resolve_jit
-from ....models import Demonstration, TabularMDP, Visibility, mixture_model
-from ....models.observation.demonstration import SEEN
+from ....models.laws.mixture import mixture_model
+from ....models.observation.demonstration import SEEN, Demonstration
+from ....models.observation.evidence import Visibility
+from ....models.process.mdp import TabularMDP
 from ..harness import print_table, publish
 from . import calibration
 from .calibration import Ranks, uniformity

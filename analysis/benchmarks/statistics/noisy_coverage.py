@@ -36,7 +36,10 @@ from scipy import stats
 
 from ....domains.noisy.tasks import SORTING_PREDICATES, noisy_sorting
 from ....inference.posteriors.noisy import NoisyProblem, noisy_chain, noisy_problem, noisy_starts
-from ....models import Demonstration, FeatureNoise, TabularMDP, TrajectoryLaw
+from ....models.laws.trajectory import TrajectoryLaw
+from ....models.observation.demonstration import Demonstration
+from ....models.observation.evidence import FeatureNoise
+from ....models.process.mdp import TabularMDP
 from ..harness import print_table, publish
 from .calibration import Ranks, uniformity
 

@@ -28,7 +28,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from ....domains.patrol.process import LEFT, RIGHT, Patrol, demonstrate, instance
-from ....models import Demonstration, TabularMDP, TrajectoryLaw, sample_demonstration
+from ....models.laws.trajectory import TrajectoryLaw, sample_demonstration
+from ....models.observation.demonstration import Demonstration
+from ....models.process.mdp import TabularMDP
 from ...posteriors.selection import compare_features, compare_posteriors, select_features, with_features
 from ..harness import print_table, publish
 

@@ -33,8 +33,9 @@ from ....domains.sorting.process import (
 from ....inference.learners.mtirl import BatchMixture, assign_trajectories, batch_mme_mtirl, mme_mtirl
 from ....inference.mixtures.clustering import Clustering
 from ....inference.sessions.learner import Learner
-from ....models import Demonstration, Sensor, TrajectoryLaw, Visibility, concatenate
-from ....models.observation.demonstration import HIDDEN, UNKNOWN
+from ....models.laws.trajectory import TrajectoryLaw
+from ....models.observation.demonstration import HIDDEN, UNKNOWN, Demonstration, concatenate
+from ....models.observation.evidence import Sensor, Visibility
 from ...judging.multi_task import adjusted_rand_index, assignment_accuracy, expected_value_difference
 from ..harness import print_table, publish
 

@@ -15,9 +15,9 @@ from jaxtyping import Array
 
 from ....domains.robots.control import mountain_car
 from ....domains.robots.experts import load_demonstrations, load_expert
-from ....domains.robots.locomotion import ROBOTS, locomotion
-from ....domains.robots.onion_reaching import OnionMover, demonstrate_onions, onion_reaching
+from ....domains.robots.reaching import OnionMover, demonstrate_onions, onion_reaching
 from ....domains.robots.simulation import simulate
+from ....domains.robots.walkers import ROBOTS, locomotion
 from ....inference.adversarial.robust import fit_isotropic, fit_shift
 from ....inference.completion.gaussian import gaussian_truth, jax_dynamics
 from ....inference.completion.partitioned import candidate_truth

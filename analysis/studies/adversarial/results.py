@@ -32,7 +32,7 @@ from ...judging.returns import (
 )
 
 if TYPE_CHECKING:
-    from ....domains.robots.locomotion import Locomotion
+    from ....domains.robots.walkers import Locomotion
 
 CLEAN, NOISY = "AIRL, clean input", "AIRL, noisy input"
 ROBUST, SSRR = "robust-AIRL, noisy input", "SSRR + noisy-AIRL, noisy input"

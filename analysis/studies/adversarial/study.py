@@ -23,8 +23,8 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float, Int
 
 from ....domains.robots.experts import load_demonstrations
-from ....domains.robots.locomotion import ROBOTS, locomotion
 from ....domains.robots.simulation import LEVELS, Perturbed, Trajectories, graded_mix, simulate
+from ....domains.robots.walkers import ROBOTS, locomotion
 from ....inference.adversarial.discriminator import airl_discriminator
 from ....inference.adversarial.learner import AdversarialTraining, adversarial
 from ....inference.adversarial.noise_injection import NoisyTraining
@@ -256,7 +256,7 @@ _SHOWN_STEPS = 100
 # -- all seeds and methods ----------------------------------------------------------------------------
 
 
-def study(
+def adversarial_study(
     name: str,
     seeds: int = 5,
     plan: Plan | None = None,

@@ -151,7 +151,7 @@ class LabelBiasStudy(NamedTuple):
     maxent: Correlation
 
 
-def study(
+def label_bias_study(
     worlds: int = 100,
     trajectories: int = 75,
     *,

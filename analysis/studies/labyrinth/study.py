@@ -164,7 +164,7 @@ class Interval(NamedTuple):
     high: float
 
 
-def study(
+def labyrinth_study(
     bouts: Sequence[Bout],
     *,
     recording: str = "recording",

@@ -157,7 +157,7 @@ def turning_places(patrol: Patrol) -> Bool[np.ndarray, " S"]:
     return turns & turns[following]
 
 
-def study(
+def methods_study(
     number: int = 2,
     *,
     sessions: int = 120,

@@ -395,7 +395,7 @@ def _doubted(task: NoisyTask, streams: Streams, result: MethodResult, scores: st
 # -- the study ----------------------------------------------------------------------------------------
 
 
-def study(
+def noisy_study(
     name: str,
     *,
     runs: int = 50,

@@ -140,7 +140,7 @@ class Stretch(NamedTuple):
     path: np.ndarray
 
 
-def study(
+def patrol_study(
     number: int = 2,
     observability: int | None = None,
     *,

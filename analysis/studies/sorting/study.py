@@ -154,7 +154,7 @@ class _Stream(NamedTuple):
     labels: Int[np.ndarray, " n"]
 
 
-def study(
+def sorting_study(
     tasks: int = 2,
     counts: Sequence[int] | None = None,
     *,

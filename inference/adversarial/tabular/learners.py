@@ -24,8 +24,8 @@ from jax import lax
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
+from ....extras import required
 from ....models.inputs.arguments import as_key
-from ....models.inputs.extras import required
 from ....models.networks.modules import DTYPE
 from ....models.observation.demonstration import Demonstration, DemonstrationError
 from ....models.observation.evidence import (

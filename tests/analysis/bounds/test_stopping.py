@@ -15,13 +15,8 @@ from i2rl.analysis.bounds.stopping import (
     sweep_tolerance,
 )
 from i2rl.analysis.drawing.style import DARK, LIGHT
-from i2rl.inference import (
-    LearningErrorChange,
-    LikelihoodChange,
-    MovingWindow,
-    PolicyWindow,
-    Report,
-)
+from i2rl.inference import LikelihoodChange, MovingWindow, PolicyWindow, Report
+from i2rl.inference.sessions.stopping import LearningErrorChange
 from i2rl.models import deterministic_policy, hard_plan, policy_values, reward_of
 
 STREAMS, SESSIONS = 8, 25

@@ -27,8 +27,10 @@ from i2rl.analysis.bounds.theorems import (
     table_7_1a,
     table_7_1b,
 )
-from i2rl.inference import FeatureTarget, solve_dual
-from i2rl.models import feature_expectations, feature_scale, reward_of, soft_plan
+from i2rl.inference import solve_dual
+from i2rl.inference.programs.constraints import FeatureTarget
+from i2rl.models import feature_expectations, reward_of, soft_plan
+from i2rl.models.process.units import feature_scale
 
 
 def test_table_7_1a_is_reproduced():

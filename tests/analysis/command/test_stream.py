@@ -17,7 +17,8 @@ from i2rl.analysis.command.quarantine import Line, Quarantine
 from i2rl.analysis.command.stream import followed, learn_stream, open_lines, read_lines
 from i2rl.inference.journal.journal import Journal, JournalError, Position
 from i2rl.inference.learners.lme import lme_i2rl
-from i2rl.models import DemonstrationError, LineLimits, TabularMDP, Visibility, concatenate, read_trajectories
+from i2rl.models import DemonstrationError, TabularMDP, Visibility, concatenate, read_trajectories
+from i2rl.models.observation.demonstration import LineLimits
 from i2rl.models.observation.storage import save_mdp
 
 KEY = jax.random.key(3)

@@ -4,12 +4,8 @@ import jax
 import numpy as np
 import pytest
 
-from i2rl.analysis import (
-    adjusted_rand_index,
-    assignment_accuracy,
-    expected_value_difference,
-    match_ways,
-)
+from i2rl.analysis import assignment_accuracy, expected_value_difference, match_ways
+from i2rl.analysis.judging.multi_task import adjusted_rand_index
 from i2rl.domains import demonstrate_sorting, sorting_with_claiming
 from i2rl.models import Demonstration
 

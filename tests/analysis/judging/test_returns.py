@@ -23,8 +23,8 @@ from i2rl.analysis.judging.returns import (
     seed_interval,
 )
 from i2rl.domains.robots.control import cart_pole, mountain_car
-from i2rl.domains.robots.locomotion import locomotion
 from i2rl.domains.robots.simulation import Perturbed, graded_mix, simulate
+from i2rl.domains.robots.walkers import locomotion
 from i2rl.models.networks.modules import ActionSpace, policy_network
 
 KEY = jax.random.key(0)

@@ -16,7 +16,7 @@ from nbclient.exceptions import CellExecutionError
 from nbformat import NotebookNode
 from PIL import Image
 
-from i2rl.analysis.notebooks.execute import execute, main, notebooks, parameters_of, tidy
+from i2rl.analysis.notebooks.execute import execute_notebook, main, notebooks, parameters_of, tidy
 
 REDUCED: dict[str, dict[str, Any]] = {
     "1-first-session.ipynb": {"SESSIONS": 20, "RUNS": 2, "STRETCH": 30},
@@ -71,7 +71,7 @@ def test_there_are_notebooks_to_be_read_in_order_and_sizes_for_no_others():
 def test_notebook_executes_at_a_reduced_size_with_the_outputs_and_figures_it_has_in_full(path):
     committed = read(path)
     assert set(REDUCED[path.name]) <= set(parameters_of(committed)), f"{path.name} has other parameters"
-    executed = execute(path, REDUCED[path.name], timeout=300)
+    executed = execute_notebook(path, REDUCED[path.name], timeout=300)
     assert [o for o in outputs(executed) if o.output_type == "error" or o.get("name") == "stderr"] == []
     assert len(pictures(executed)) == len(pictures(committed)) > 0
     for before, now in zip(code_cells(committed), code_cells(executed), strict=True):
@@ -116,14 +116,14 @@ def test_committed_figures_are_pictures_of_something(path):
 def test_parameters_replace_those_of_the_cell_and_reach_the_cells_after_it(tmp_path):
     path = made_notebook(tmp_path, "print(SIZE * 2, NAME)", parameters="SIZE = 3\nNAME = 'a'")
     assert parameters_of(read(path)) == {"SIZE": 3, "NAME": "a"}
-    assert outputs(execute(path))[0].text == "6 a\n"
-    assert outputs(execute(path, {"SIZE": 50}))[0].text == "100 a\n"
+    assert outputs(execute_notebook(path))[0].text == "6 a\n"
+    assert outputs(execute_notebook(path, {"SIZE": 50}))[0].text == "100 a\n"
     assert outputs(read(path)) == []  # nothing is written
 
 
 def test_unknown_parameter_is_refused_with_those_there_are(tmp_path):
     with pytest.raises(ValueError, match=r"made\.ipynb has no parameter SIZES; it has SIZE"):
-        execute(made_notebook(tmp_path, "SIZE"), {"SIZES": 1})
+        execute_notebook(made_notebook(tmp_path, "SIZE"), {"SIZES": 1})
 
 
 def test_parameter_that_is_no_literal_is_refused(tmp_path):
@@ -155,7 +155,7 @@ def test_execution_in_place_leaves_one_result_however_often(tmp_path):
 
 
 def test_tidying_is_idempotent_and_keeps_all_but_machine_metadata(tmp_path):
-    notebook = execute(
+    notebook = execute_notebook(
         made_notebook(
             tmp_path, "import matplotlib.pyplot as plt\n%matplotlib inline\nplt.plot([1, 3, SIZE]);"
         )

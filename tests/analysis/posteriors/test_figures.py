@@ -7,19 +7,18 @@ import numpy as np
 import pytest
 
 from i2rl.analysis import (
-    InferenceDataError,
     completed_path,
-    convergence_plot,
     forest_plot,
     posterior_by_session,
     predictive_check,
-    predictive_plot,
     predictive_visits,
     rank_plot,
     trace_plot,
     weights_by_session,
 )
 from i2rl.analysis.drawing.style import DARK, THEMES
+from i2rl.analysis.posteriors.diagnostics import InferenceDataError
+from i2rl.analysis.posteriors.figures import convergence_plot, predictive_plot
 from i2rl.domains import instance
 from i2rl.inference import sample_posterior
 from i2rl.models import TrajectoryLaw, Visibility, sample_demonstration

@@ -10,17 +10,8 @@ import numpy as np
 import pytest
 
 from i2rl.analysis.posteriors.history import fleet_history, provenance, run_history
-from i2rl.inference import (
-    CountStatistic,
-    FeatureStatistic,
-    Learner,
-    Report,
-    darko_i2rl,
-    fleet,
-    jin_i2rl,
-    run_sessions,
-)
-from i2rl.inference.sessions.statistic import blend
+from i2rl.inference import Learner, Report, darko_i2rl, fleet, jin_i2rl, run_sessions
+from i2rl.inference.sessions.statistic import CountStatistic, FeatureStatistic, blend
 from i2rl.models import TrajectoryLaw, sample_demonstration
 from i2rl.models.observation.evidence import Sensor
 from i2rl.version import __version__

@@ -31,13 +31,12 @@ from i2rl.models import (
     TabularMDP,
     TrajectoryLaw,
     Visibility,
-    reachable_states,
     reward_of,
     sample_demonstration,
     soft_plan,
 )
 from i2rl.models.observation.evidence import log_evidence
-from i2rl.models.process.planning import finite_occupancy
+from i2rl.models.process.planning import finite_occupancy, reachable_states
 
 THETA = jnp.array([0.8, -1.1])
 # Small demonstrations are padded to one shape, and their sensors of one type, so that they share programs.

@@ -5,9 +5,10 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from i2rl.domains import Interaction, instance, simulate_patrol
+from i2rl.domains import instance, simulate_patrol
 from i2rl.domains.patrol.breach import BreachSettings, line_of_sight
 from i2rl.domains.patrol.environment import WAIT, BreachEnv
+from i2rl.domains.patrol.process import Interaction
 
 FORWARD, LEFT, RIGHT = range(3)
 

@@ -21,7 +21,7 @@ from i2rl.domains.robots.experts import (
     store_expert,
     train_expert,
 )
-from i2rl.domains.robots.locomotion import ROBOTS, locomotion
+from i2rl.domains.robots.walkers import ROBOTS, locomotion
 from i2rl.models import StorageError
 
 

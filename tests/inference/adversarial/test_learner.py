@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from i2rl.domains.robots.control import cart_pole
-from i2rl.domains.robots.onion_reaching import onion_reaching
+from i2rl.domains.robots.reaching import onion_reaching
 from i2rl.inference.adversarial.discriminator import airl_discriminator, gail_discriminator
 from i2rl.inference.adversarial.learner import AdversarialTraining, adversarial, airl
 from i2rl.inference.adversarial.noise_injection import NoisyTraining, noisy_airl

@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from i2rl.inference import FeatureTarget, fleet, me_i2rl, run_sessions, solve_dual
+from i2rl.inference import fleet, me_i2rl, run_sessions, solve_dual
 from i2rl.inference.learners.darko import (
     darko_i2rl,
     ending_at,
@@ -15,6 +15,7 @@ from i2rl.inference.learners.darko import (
     stopping_places,
     with_end,
 )
+from i2rl.inference.programs.constraints import FeatureTarget
 from i2rl.models import (
     Demonstration,
     DemonstrationError,

@@ -4,19 +4,10 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from i2rl.inference import (
-    Harmonic,
-    batch_lme,
-    fit_counts,
-    fleet,
-    lme_i2rl,
-    lme_i2rl_with_random_weights,
-    me_i2rl,
-    run_sessions,
-    solve_dual,
-)
+from i2rl.inference import Harmonic, batch_lme, fit_counts, fleet, lme_i2rl, me_i2rl, run_sessions, solve_dual
 from i2rl.inference.completion.smoothing import evidence_of, log_likelihoods
 from i2rl.inference.journal.journal import Journal
+from i2rl.inference.learners.lme import lme_i2rl_with_random_weights
 from i2rl.inference.programs.constraints import FeatureTarget
 from i2rl.models import (
     Demonstration,

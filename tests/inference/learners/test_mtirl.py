@@ -9,15 +9,9 @@ import pytest
 
 from i2rl.analysis.judging.multi_task import assignment_accuracy, expected_value_difference
 from i2rl.domains.sorting.process import demonstrate_sorting, sorting_with_claiming
-from i2rl.inference import (
-    assign_trajectories,
-    batch_mme_mtirl,
-    clustering_of,
-    mme_mtirl,
-    run_sessions,
-    run_streams,
-)
+from i2rl.inference import batch_mme_mtirl, mme_mtirl, run_sessions, run_streams
 from i2rl.inference.journal.journal import Journal
+from i2rl.inference.learners.mtirl import assign_trajectories, clustering_of
 from i2rl.models import (
     Demonstration,
     DemonstrationError,

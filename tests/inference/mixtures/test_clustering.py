@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from i2rl.inference import Clustering
+from i2rl.inference.mixtures.clustering import Clustering
 
 
 def test_a_trajectory_belongs_to_its_likeliest_way():

@@ -20,7 +20,7 @@ from i2rl.inference.mixtures.fit import (
     empty_mixture,
     nothing_kept,
 )
-from i2rl.inference.mixtures.search import merge_once
+from i2rl.inference.mixtures.merging import merge_once
 from i2rl.inference.programs.entropic import entropic_proportions
 from i2rl.inference.programs.maximum_entropy import count_information
 from i2rl.inference.programs.minmax import MinMaxProgram

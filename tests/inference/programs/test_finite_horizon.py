@@ -18,7 +18,8 @@ from i2rl.inference.programs.finite_horizon import (
     fit_weights,
     state_reward,
 )
-from i2rl.models import TabularMDP, finite_hard_plan, finite_occupancy, finite_soft_plan, reward_of
+from i2rl.models import TabularMDP, finite_soft_plan, reward_of
+from i2rl.models.process.planning import finite_hard_plan, finite_occupancy
 
 T = 6  # one horizon, so that most tests share compiled programs
 

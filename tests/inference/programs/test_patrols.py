@@ -3,7 +3,8 @@ import numpy as np
 import pytest
 
 from i2rl.domains import instance
-from i2rl.inference import DualProgram, FeatureTarget, PrimalProgram, solve_dual
+from i2rl.inference import DualProgram, PrimalProgram, solve_dual
+from i2rl.inference.programs.constraints import FeatureTarget
 from i2rl.models import feature_expectations, reward_of, soft_plan
 
 

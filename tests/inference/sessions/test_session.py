@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from i2rl.inference import (
-    LearningErrorChange,
     LikelihoodChange,
     MovingWindow,
     PolicyWindow,
@@ -23,6 +22,7 @@ from i2rl.inference import (
 from i2rl.inference.journal.journal import Journal
 from i2rl.inference.learners.jin import jin_i2rl
 from i2rl.inference.sessions.serialization import demonstration_digest
+from i2rl.inference.sessions.stopping import LearningErrorChange
 from i2rl.models import (
     Demonstration,
     Sensor,

@@ -21,7 +21,6 @@ from i2rl.inference import (
     darko_i2rl,
     dpm_birl,
     em_mlirl,
-    evidence_of,
     fleet,
     gibbs_mixture_posterior,
     jin_i2rl,
@@ -37,6 +36,7 @@ from i2rl.inference import (
     sample_posterior,
     sensor_identification,
 )
+from i2rl.inference.completion.smoothing import evidence_of
 from i2rl.models import (
     Confusions,
     Demonstration,

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from scipy import stats
 
+from i2rl.extras import required
 from i2rl.inference.sessions.serialization import decode, encode, restore
-from i2rl.models.inputs.extras import required
 from i2rl.models.networks.modules import (
     MLP,
     ActionSpace,

@@ -16,22 +16,24 @@ from hypothesis import strategies as st
 from i2rl.models import (
     TabularMDP,
     deterministic_policy,
-    feature_deviations,
     feature_expectations,
-    features_to_go,
-    finite_hard_plan,
-    finite_occupancy,
     finite_soft_plan,
     hard_plan,
     occupancy,
     policy_values,
-    reachable_states,
     reward_of,
     simulate,
     soft_plan,
 )
 from i2rl.models.process import planning
-from i2rl.models.process.planning import soft_backup
+from i2rl.models.process.planning import (
+    feature_deviations,
+    features_to_go,
+    finite_hard_plan,
+    finite_occupancy,
+    reachable_states,
+    soft_backup,
+)
 
 S, A, K = 4, 3, 2
 WEIGHTS = jnp.array([1.5, -0.8])

@@ -42,7 +42,7 @@ from i2rl.analysis.studies.adversarial.results import (
     store_results,
 )
 from i2rl.analysis.studies.noisy.examples import Strip
-from i2rl.domains.robots.locomotion import locomotion
+from i2rl.domains.robots.walkers import locomotion
 from i2rl.models import Demonstration, StorageError
 
 LEVELS = {CLEAN: 2000.0, NOISY: 600.0, ROBUST: 1800.0, SSRR: 1500.0}

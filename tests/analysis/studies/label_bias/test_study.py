@@ -119,7 +119,7 @@ def test_correlation_is_pearsons():
 @cache
 def _study():
     settings = (Setting(), Setting(OPTIMAL, eta=10.0), Setting(MAXENT, blocked=False))
-    return label_bias.study(_WORLDS, _TRAJECTORIES, seed=3, settings=settings, etas=(1.0, 10.0))
+    return label_bias.label_bias_study(_WORLDS, _TRAJECTORIES, seed=3, settings=settings, etas=(1.0, 10.0))
 
 
 def test_maximum_entropy_has_no_label_bias():
@@ -150,7 +150,9 @@ def test_the_world_shown_is_the_median_one():
 
 def test_the_same_seed_gives_the_same_numbers():
     few = {"settings": (Setting(),), "etas": (1.0,)}
-    one, again, other = (label_bias.study(_WORLDS, _TRAJECTORIES, seed=s, **few) for s in (0, 0, 1))
+    one, again, other = (
+        label_bias.label_bias_study(_WORLDS, _TRAJECTORIES, seed=s, **few) for s in (0, 0, 1)
+    )
     assert (one.results[0].birl == again.results[0].birl).all()
     assert (one.results[0].birl != other.results[0].birl).any()
 
@@ -158,12 +160,12 @@ def test_the_same_seed_gives_the_same_numbers():
 @pytest.mark.parametrize("given", [(0, 75), (3, 3)])
 def test_too_little_is_refused(given):
     with pytest.raises(ValueError, match="at least 1 world, 4 trajectories"):
-        label_bias.study(*given)
+        label_bias.label_bias_study(*given)
 
 
 def test_an_unknown_expert_is_refused():
     with pytest.raises(ValueError, match="expert must be"):
-        label_bias.study(1, 4, settings=(Setting("lucky"),), etas=())
+        label_bias.label_bias_study(1, 4, settings=(Setting("lucky"),), etas=())
 
 
 @pytest.mark.usefixtures("small_pictures")
@@ -232,7 +234,9 @@ def test_the_page_is_complete(tmp_path, page_faults):
 
 @pytest.mark.usefixtures("small_pictures")
 def test_the_command_writes_its_page(tmp_path, monkeypatch):
-    monkeypatch.setattr(label_bias, "study", lambda worlds, *_, **__: _study()._replace(worlds=worlds))
+    monkeypatch.setattr(
+        label_bias, "label_bias_study", lambda worlds, *_, **__: _study()._replace(worlds=worlds)
+    )
     result = CliRunner().invoke(
         app,
         ["run", "label-bias", "--worlds", str(_WORLDS), "--report", str(tmp_path), "--json"],

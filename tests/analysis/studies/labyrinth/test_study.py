@@ -17,10 +17,10 @@ from i2rl.analysis.studies.labyrinth.figures import value_on_maze, values_by_nod
 from i2rl.analysis.studies.labyrinth.page import print_tables, summary, tables, write
 from i2rl.analysis.studies.labyrinth.study import (
     bits_per_decision,
+    labyrinth_study,
     predict_with_learner,
     predict_with_table,
     predict_with_tables,
-    study,
 )
 from i2rl.domains.labyrinth.process import (
     FIRST_END,
@@ -57,7 +57,7 @@ def mouse():
 
 @pytest.fixture(scope="module")
 def result(mouse):
-    return study(mouse, recording="a simulated mouse", discount=DISCOUNT, ridge=2.0)
+    return labyrinth_study(mouse, recording="a simulated mouse", discount=DISCOUNT, ridge=2.0)
 
 
 def score(result, method, view=0):
@@ -186,7 +186,7 @@ def test_intervals_hold_the_estimate_and_vanish_for_equal_bouts():
 
 def test_an_empty_recording_is_refused():
     with pytest.raises(ValueError, match="no bouts"):
-        study([])
+        labyrinth_study([])
 
 
 @pytest.mark.usefixtures("small_pictures")
@@ -218,7 +218,7 @@ def test_the_command_writes_its_page(result, tmp_path, monkeypatch):
         asked.update(options, bouts=len(bouts))
         return result
 
-    monkeypatch.setattr("i2rl.analysis.studies.labyrinth.study.study", shared)
+    monkeypatch.setattr("i2rl.analysis.studies.labyrinth.study.labyrinth_study", shared)
     recording = tmp_path / "mouse.jsonl"
     recording.write_text('{"nodes": [0, 1, 0, 127]}\n' * 2)
     command = [

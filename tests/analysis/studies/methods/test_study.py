@@ -63,7 +63,7 @@ METHODS = ("Jin et al., features", "DARKO, goals", "LME-I2RL, seen")
 
 @cache
 def small_study():
-    return online_methods.study(2, sessions=8, runs=1, seed=1, rates=(0.3,), methods=METHODS)
+    return online_methods.methods_study(2, sessions=8, runs=1, seed=1, rates=(0.3,), methods=METHODS)
 
 
 def test_every_method_is_measured_at_the_same_pairs():
@@ -93,7 +93,7 @@ def test_the_figure_shows_the_medians(theme):
 
 @pytest.mark.usefixtures("small_pictures")
 def test_run_methods_writes_a_page(tmp_path, monkeypatch, page_faults):
-    monkeypatch.setattr(online_methods, "study", lambda *_, **__: small_study())
+    monkeypatch.setattr(online_methods, "methods_study", lambda *_, **__: small_study())
     folder = tmp_path / "report"
     shown = CliRunner().invoke(app, ["run", "methods", "--report", str(folder)])
     assert shown.exit_code == 0, shown.output
@@ -114,6 +114,6 @@ def test_run_methods_writes_a_page(tmp_path, monkeypatch, page_faults):
 
 def test_an_instance_or_method_that_does_not_exist_is_refused():
     with pytest.raises(ValueError, match="instances are 1, 2 and 3, got 7"):
-        online_methods.study(7)
+        online_methods.methods_study(7)
     with pytest.raises(ValueError, match=r"methods are Jin .*; got 'AIRL'"):
-        online_methods.study(2, methods=["AIRL"])
+        online_methods.methods_study(2, methods=["AIRL"])

@@ -37,7 +37,7 @@ def task():
 
 @cache
 def small():
-    return noisy_study.study(
+    return noisy_study.noisy_study(
         "sorting", runs=2, sessions=2, seed=3, belts=8, draws=0, methods=("MLIRL, batch",)
     )
 
@@ -203,16 +203,18 @@ def test_strip_marks_every_report_and_every_truth(theme):
 
 def test_mistakes_are_named():
     with pytest.raises(ValueError, match="tasks are sorting, patrol; got 'laundry'"):
-        noisy_study.study("laundry")
+        noisy_study.noisy_study("laundry")
     with pytest.raises(ValueError, match="runs must be at least 1, got 0"):
-        noisy_study.study("sorting", runs=0)
+        noisy_study.noisy_study("sorting", runs=0)
     with pytest.raises(ValueError, match=r"methods are RIMEO, no scores; .*; got 'AIRL'"):
-        noisy_study.study("sorting", methods=("AIRL",))
+        noisy_study.noisy_study("sorting", methods=("AIRL",))
 
 
 @pytest.mark.usefixtures("small_pictures")
 def test_command_writes_its_page(tmp_path, monkeypatch):
-    monkeypatch.setattr(noisy_study, "study", lambda name, **options: small()._replace(seed=options["seed"]))
+    monkeypatch.setattr(
+        noisy_study, "noisy_study", lambda name, **options: small()._replace(seed=options["seed"])
+    )
     options = ["--runs", "2", "--sessions", "2", "--seed", "5", "--report", str(tmp_path), "--json"]
     result = CliRunner().invoke(app, ["run", "noisy-sorting", *options])
     assert result.exit_code == 0, result.output

@@ -39,7 +39,7 @@ from i2rl.inference.learners.dpm import dpm_birl
 @cache
 def small():
     """The quickest methods to compile, few and short trajectories."""
-    return sorting_study.study(
+    return sorting_study.sorting_study(
         2, (6,), runs=2, steps=20, methods=("dpm-birl", "em-mlirl"), belts=20, ways=3, seed=3
     )
 
@@ -119,7 +119,7 @@ def test_a_behaviour_without_a_way_is_carried_out_as_its_trajectories_were_taken
 )
 def test_bad_studies_are_told(given, complaint):
     with pytest.raises(ValueError, match=complaint):
-        sorting_study.study(**given)
+        sorting_study.sorting_study(**given)
 
 
 def test_numbers_of_trajectories_are_read_from_text():
@@ -221,7 +221,7 @@ def test_command_writes_its_page(tmp_path, monkeypatch, page_faults):
         asked.update(options, tasks=tasks, counts=list(counts))
         return small()
 
-    monkeypatch.setattr(sorting_study, "study", shared)
+    monkeypatch.setattr(sorting_study, "sorting_study", shared)
     command = ["run", "sorting", "--trajectories", "6", "--runs", "1", "--method", "em-mlirl", "--steps"]
     command += ["20", "--belts", "10", "--json", "--report", str(tmp_path)]
     result = CliRunner().invoke(app, command)

@@ -13,7 +13,6 @@ from typer.testing import CliRunner
 
 from i2rl.analysis.command.app import app
 from i2rl.analysis.studies.adversarial import patrol as adversarial_patrol
-from i2rl.analysis.studies.adversarial.answer import answer
 from i2rl.analysis.studies.adversarial.cases import PLANS
 from i2rl.analysis.studies.adversarial.page import breach_table, learning_table
 from i2rl.analysis.studies.adversarial.patrol import believed_trajectories, patrol_results
@@ -26,7 +25,8 @@ from i2rl.analysis.studies.adversarial.results import (
     MethodResult,
     load_results,
 )
-from i2rl.analysis.studies.adversarial.study import run, study
+from i2rl.analysis.studies.adversarial.running import answer
+from i2rl.analysis.studies.adversarial.study import adversarial_study, run
 from i2rl.domains.patrol.process import FORWARD, LEFT, RIGHT
 
 TRIALS, SESSIONS = 3, 2
@@ -141,6 +141,6 @@ def test_studies_that_cannot_be_are_refused():
     with pytest.raises(ValueError, match=r"domain is one of patrol, hopper.*got 'ant'"):
         answer("ant")
     with pytest.raises(ValueError, match="at least one session, got 0"):
-        study("mountain-car", 1, PLANS["mountain-car"]._replace(sessions=0))
+        adversarial_study("mountain-car", 1, PLANS["mountain-car"]._replace(sessions=0))
     with pytest.raises(ValueError, match=r"method is one of AIRL, clean input.*got 'AIRL'"):
         run("mountain-car", "AIRL", 0, PLANS["mountain-car"])

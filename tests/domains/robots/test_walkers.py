@@ -11,7 +11,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 
 pytest.importorskip("mujoco")
 
-from i2rl.domains.robots.locomotion import ROBOTS, locomotion
+from i2rl.domains.robots.walkers import ROBOTS, locomotion
 
 PEERS = {"hopper": "Hopper-v5", "walker2d": "Walker2d-v5", "half-cheetah": "HalfCheetah-v5"}
 

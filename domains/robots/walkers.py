@@ -27,7 +27,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from ...models.inputs.extras import required
+from ...extras import required
 from ...models.networks.modules import ActionSpace
 
 if TYPE_CHECKING:

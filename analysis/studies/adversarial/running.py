@@ -40,7 +40,7 @@ def answer(
     plan = _scaled(PLANS[domain], noise)
     if sessions is not None:
         plan = plan._replace(sessions=sessions)
-    return adversarial_study.study(
+    return adversarial_study.adversarial_study(
         domain, seeds, plan, workers=workers, folder=kept, machine=_machine(), advance=advance
     )
 

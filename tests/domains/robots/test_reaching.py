@@ -11,7 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from i2rl.domains.robots.onion_reaching import (
+from i2rl.domains.robots.onion_recordings import read_onion_recordings, write_onion_recordings
+from i2rl.domains.robots.reaching import (
     STRIDE,
     OnionMover,
     Scene,
@@ -22,7 +23,6 @@ from i2rl.domains.robots.onion_reaching import (
     onion_reaching,
     scene,
 )
-from i2rl.domains.robots.onion_recordings import read_onion_recordings, write_onion_recordings
 from i2rl.domains.robots.simulation import simulate
 from i2rl.models.observation.recordings import RecordingError
 

@@ -1,0 +1,105 @@
+"""The package's structure: rooms, names and their homes."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+import i2rl
+
+ROOT = Path(i2rl.__file__).resolve().parent
+FOLDERS = ("models", "inference", "domains", "analysis")
+MODULES = sorted(p for folder in FOLDERS for p in (ROOT / folder).rglob("*.py"))
+
+
+def imported_names(path: Path) -> list[tuple[str, str]]:
+    """Modules of this package that a file imports from, with the names it takes."""
+    tree = ast.parse(path.read_text())
+    ours = [n for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
+    return [
+        (node.module or "", alias.name)
+        for node in ours
+        if node.level or (node.module or "").split(".")[0] == "i2rl"
+        for alias in node.names
+    ]
+
+
+def test_no_room_holds_more_than_twelve_modules():
+    rooms = Counter(p.parent.relative_to(ROOT) for p in MODULES if p.name != "__init__.py")
+    assert {str(room): n for room, n in rooms.items() if n > 12} == {}
+
+
+def test_every_room_says_what_is_in_it():
+    rooms = {p.parent for p in MODULES}
+    assert [r for r in rooms if not ast.get_docstring(ast.parse((r / "__init__.py").read_text()))] == []
+
+
+@pytest.mark.parametrize("folder", [*FOLDERS, "tests"])
+def test_no_private_name_is_imported_from_another_module(folder):
+    private = [
+        (str(path.relative_to(ROOT)), module, name)
+        for path in (ROOT / folder).rglob("*.py")
+        for module, name in imported_names(path)
+        if name.startswith("_") and not name.startswith("__")
+    ]
+    assert private == []
+
+
+def test_no_module_has_the_name_of_a_function_that_it_defines():
+    defined = {
+        path: {n.name for n in ast.parse(path.read_text()).body if isinstance(n, ast.FunctionDef)}
+        for path in MODULES
+    }
+    assert [str(p.relative_to(ROOT)) for p, names in defined.items() if p.stem in names] == []
+
+
+def test_tests_lie_in_the_tree_of_what_they_test():
+    folders = {p.parent.relative_to(ROOT / "tests") for p in (ROOT / "tests").rglob("test_*.py")}
+    assert [str(folder) for folder in folders if not (ROOT / folder).is_dir()] == []
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_a_face_lists_its_names_completely_and_loads_each(folder):
+    face = importlib.import_module(f"i2rl.{folder}")
+    assert len(face.__all__) <= 52
+    assert set(face.__all__) <= set(dir(face))
+    for name in face.__all__:
+        home = getattr(face, name)
+        assert getattr(home, "__name__", name) == name
+
+
+def test_importing_the_faces_loads_no_solver():
+    heavy = ["casadi", "cvxpy", "pymc", "arviz", "matplotlib", "numpyro", "equinox", "mujoco"]
+    script = f"""
+import sys
+import i2rl.models, i2rl.inference, i2rl.analysis
+assert not [name for name in {heavy} if name in sys.modules], [n for n in {heavy} if n in sys.modules]
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=120)
+
+
+def test_without_the_extra_star_imports_work_and_the_use_says_what_to_install():
+    script = """
+import sys
+for name in ("equinox", "optax", "mujoco"):
+    sys.modules[name] = None
+from i2rl.domains import *
+from i2rl.inference import *
+from i2rl.models import *
+import i2rl.inference, pydoc
+assert "lme_i2rl" in pydoc.render_doc(i2rl.inference)
+for use in (lambda: airl(), lambda: ppo(), lambda: noisy_airl(), lambda: ssrr()):
+    try:
+        use()
+    except ModuleNotFoundError as missing:
+        assert "pip install 'i2rl[adversarial]'" in str(missing), missing
+    else:
+        raise AssertionError("it ran without the extra")
+"""
+    subprocess.run([sys.executable, "-c", script], check=True, timeout=300)
