@@ -33,7 +33,7 @@ bench: $(READY)
 	$(BIN)/python -m i2rl.analysis.benchmarks.cost.planning
 	$(BIN)/python -m i2rl.analysis.benchmarks.cost.posterior
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.calibration
-	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.ways
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.components
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.mixture
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.coverage
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.regret

@@ -62,7 +62,7 @@ from .judging.multi_task import (
     expected_value_difference as expected_value_difference,
 )
 from .judging.multi_task import (
-    match_ways as match_ways,
+    match_components as match_components,
 )
 from .posteriors.diagnostics import (
     posterior_by_session as posterior_by_session,

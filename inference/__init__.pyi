@@ -131,7 +131,7 @@ from .sessions.learner import (
     Learner as Learner,
 )
 from .sessions.learner import (
-    Report as Report,
+    SessionInfo as SessionInfo,
 )
 from .sessions.running import (
     Run as Run,

@@ -27,7 +27,7 @@ from ...inference.programs.maximum_entropy import solve_dual
 from ...inference.sessions.fleets import fleet
 from ...models.laws.chain import filter_all, sample_backward, smooth_all
 from ...models.observation.demonstration import Demonstration
-from ...models.observation.evidence import Imperfection, observe, step_log_evidence
+from ...models.observation.evidence import AnySensor, observe, step_log_evidence
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import features_to_go, reward_of, simulate, soft_plan
 from ...models.process.units import feature_scale
@@ -51,7 +51,7 @@ class Setting(NamedTuple):
     name: str
     mdp: TabularMDP
     weights: Float[Array, " K"]
-    sensor: Imperfection
+    sensor: AnySensor
     length: int
 
 
@@ -123,7 +123,7 @@ def simulate_features(
 
 @partial(jax.jit, static_argnames=("length", "runs", "size"))
 def simulate_codes(
-    key: Array, mdp: TabularMDP, expert: Expert, sensor: Imperfection, length: int, runs: int, size: int
+    key: Array, mdp: TabularMDP, expert: Expert, sensor: AnySensor, length: int, runs: int, size: int
 ) -> Int[Array, "runs size L 3"]:
     """What a sensor lets through of independent trajectories, as :attr:`Demonstration.codes`."""
 
@@ -146,7 +146,7 @@ class Completed(NamedTuple):
 
 @partial(jax.jit, static_argnames=("draws",))
 def complete_features(
-    key: Array, mdp: TabularMDP, expert: Expert, sensor: Imperfection, codes: Array, draws: int
+    key: Array, mdp: TabularMDP, expert: Expert, sensor: AnySensor, codes: Array, draws: int
 ) -> Completed:
     """Complete each trajectory of ``codes [runs, size, L, 3]``, exactly and by ``draws`` backward samples."""
     runs, size, length, _ = codes.shape
@@ -317,7 +317,7 @@ def learned_coverage(
 
 
 def learned_gaps(
-    key: Array, setting: Setting, assumed: Imperfection, runs: int, size: int, slack: float, batch: int = 25
+    key: Array, setting: Setting, assumed: AnySensor, runs: int, size: int, slack: float, batch: int = 25
 ) -> Float[np.ndarray, " runs"]:
     """Expected gaps of LME-I2RL with the features statistic, which believes in the sensor ``assumed``.
 

@@ -12,18 +12,18 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from ...models.observation.evidence import Imperfection
+from ...models.observation.evidence import AnySensor
 from .checks import counted, positive
 
 
 class Perception(NamedTuple):
     """What the bounds ask about perception.
 
-    ``samples`` used to estimate the observation model (``n_o``), its error ``epsilon_o``, the number of
+    ``draws`` used to estimate the observation model (``n_o``), its error ``epsilon_o``, the number of
     ``predicates`` (``|Psi|``), and the ``longest`` trajectory's steps (``L``).
     """
 
-    samples: float
+    draws: float
     epsilon_o: float
     predicates: int
     longest: int
@@ -86,15 +86,15 @@ class ModelDistance(NamedTuple):
 
 
 def model_distance(
-    one: Imperfection, other: Imperfection, truths: Bool[np.ndarray, "S A"] | None = None
+    one: AnySensor, other: AnySensor, truths: Bool[np.ndarray, "S A"] | None = None
 ) -> ModelDistance:
     """Compare two observation models of any kind, at the ``truths`` that can occur (all by default).
 
     Raises ``ValueError`` for imperfections without an observation model, or about different pairs.
     """
-    if one.reading is None or other.reading is None:
+    if one.noise is None or other.noise is None:
         raise ValueError("an imperfection without an observation model reports exactly: nothing to compare")
-    tables = [np.asarray(x.reading.log_probabilities) for x in (one, other)]  # type: ignore[union-attr]
+    tables = [np.asarray(x.noise.log_probabilities) for x in (one, other)]  # type: ignore[union-attr]
     if tables[0].shape != tables[1].shape:
         raise ValueError(f"the models are about pairs {tables[0].shape[:2]} and {tables[1].shape[:2]}")
     mask = np.ones(tables[0].shape[:2], bool) if truths is None else np.asarray(truths, bool)

@@ -80,8 +80,8 @@ def complete_under(
 
     def one(inputs: tuple) -> Completed:
         key, p, codes = inputs
-        reading = FeatureNoise(noise.predicates, p, noise.reportable).reading
-        completed = complete_features(key, mdp, expert, reading, codes[None], draws)
+        perceived = FeatureNoise(noise.predicates, p, noise.reportable).noise
+        completed = complete_features(key, mdp, expert, perceived, codes[None], draws)
         return Completed(*(x[0] for x in completed))
 
     return lax.map(one, (jax.random.split(key, len(codes)), reliabilities, codes))
@@ -100,7 +100,7 @@ def perception_coverage(
     noise, expert = noise_of(setting), expert_of(mdp, setting.weights)
     n_predicates = len(noise.predicates)
     walk, count, fill = jax.random.split(key, 3)
-    codes = simulate_codes(walk, mdp, expert, noise.reading, setting.length, runs, size)
+    codes = simulate_codes(walk, mdp, expert, noise.noise, setting.length, runs, size)
     counted = counted_reliabilities(count, noise, runs, reports)
     completed = complete_under(fill, mdp, expert, noise, counted, codes, draws)
     epsilon, epsilon_s = error_for(size, delta, n_features), error_for(size * draws, delta, n_features)
@@ -190,7 +190,7 @@ def posterior_change(key: Array, setting: Setting, epsilon_o: float, runs: int, 
     mdp, unit = setting.mdp, 1 - float(setting.mdp.discount)
     noise, expert = noise_of(setting), expert_of(mdp, setting.weights)
     walk, side, fill = jax.random.split(key, 3)
-    codes = simulate_codes(walk, mdp, expert, noise.reading, setting.length, runs, size)
+    codes = simulate_codes(walk, mdp, expert, noise.noise, setting.length, runs, size)
     true = noise.reliabilities
     off = true + epsilon_o * jax.random.rademacher(side, (runs, len(true)), float)
     if not bool(((off > 0) & (off < 1)).all()):

@@ -84,7 +84,7 @@ from .theorems import (
 
 
 def rimeo_constraint_bound(
-    size: float, samples: float, epsilon: float, epsilon_s: float, perception: Perception, n_features: int
+    size: float, draws: float, epsilon: float, epsilon_s: float, perception: Perception, n_features: int
 ) -> Bound:
     """Lemma 4 (chapter 6), Lemma 8 (appendix E), as printed: constraint bound under estimated perception.
 
@@ -93,12 +93,12 @@ def rimeo_constraint_bound(
     epsilon_o^2)``. The module says what is wrong with it; :func:`noisy_constraint_bound` is what can be
     proved.
     """
-    lemma = lme_constraint_bound(size, samples, epsilon, epsilon_s, n_features)
+    lemma = lme_constraint_bound(size, draws, epsilon, epsilon_s, n_features)
     counted("predicates", perception.predicates), counted("longest", perception.longest)
     deltas = (
         failure_probability(size, epsilon, n_features),
-        failure_probability(samples, epsilon_s, n_features),
-        failure_probability(perception.samples, perception.epsilon_o, n_features * perception.predicates),
+        failure_probability(draws, epsilon_s, n_features),
+        failure_probability(perception.draws, perception.epsilon_o, n_features * perception.predicates),
     )
     error = lemma.error + perception.longest * perception.predicates * perception.epsilon_o
     return Bound(
@@ -148,7 +148,7 @@ def _corrected(
     size: float, epsilon: float, distance: float, perception: Perception, n_features: int, more: tuple
 ) -> Bound:
     delta = failure_probability(size, epsilon, n_features)
-    delta_o = failure_probability(perception.samples, perception.epsilon_o, perception.predicates)
+    delta_o = failure_probability(perception.draws, perception.epsilon_o, perception.predicates)
     return Bound(
         "Lemma 4 (Lemma 8 of appendix E), corrected",
         "(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + d",
@@ -164,7 +164,7 @@ def _corrected(
 
 def rimeo_confidence(
     size: float,
-    samples: float,
+    draws: float,
     epsilon: float,
     epsilon_s: float,
     perception: Perception,
@@ -180,7 +180,7 @@ def rimeo_confidence(
     gamma)`` follows: the factor ``K`` belongs to weights in [0, 1]^K (:func:`noisy_confidence` has it as
     ``norm``).
     """
-    lemma = rimeo_constraint_bound(size, samples, epsilon, epsilon_s, perception, n_features)
+    lemma = rimeo_constraint_bound(size, draws, epsilon, epsilon_s, perception, n_features)
     return Bound(
         "Theorem 6 of appendix E",
         "LL(theta_E) - LL(theta) <= 2 K epsilon_r / (1 - gamma)",
@@ -263,15 +263,15 @@ def rimeo_no_regret(
     plain = no_regret(c, session_sizes, n_features, discount)
     i = np.arange(1, len(plain.average) + 1)
     third = c * (1 - discount) / i / 3
-    samples, reports = counted_sessions(session_samples), counted_sessions(session_reports)
-    if not len(samples) == len(reports) == len(i):
+    draws, reports = counted_sessions(session_samples), counted_sessions(session_reports)
+    if not len(draws) == len(reports) == len(i):
         raise ValueError(
-            f"{len(i)} session sizes, but {len(samples)} numbers of samples and {len(reports)} of reports"
+            f"{len(i)} session sizes, but {len(draws)} numbers of samples and {len(reports)} of reports"
         )
     epsilon_o = third / (longest * predicates)
     delta = 2 * n_features * (
         np.exp(-2 * np.cumsum(counted_sessions(session_sizes)) * third**2)
-        + np.exp(-2 * samples * third**2)
+        + np.exp(-2 * draws * third**2)
         + predicates * np.exp(-2 * np.cumsum(reports) * epsilon_o**2)
     )  # fmt: skip
     confidence = np.cumprod(np.maximum(0.0, 1 - delta))

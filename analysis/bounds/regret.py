@@ -36,7 +36,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
 from ...inference.sessions.fleets import run_streams
-from ...inference.sessions.learner import Learner, Report
+from ...inference.sessions.learner import Learner, SessionInfo
 from ...inference.sessions.running import average_regret
 from ...inference.sessions.statistic import STATISTICS
 from ...models.observation.demonstration import Demonstration
@@ -137,7 +137,7 @@ def regret_gaps(
     expert_weights = jnp.asarray(expert_weights, float)
     expert_values = soft_plan(mdp, reward_of(mdp, expert_weights)).values
 
-    def gaps(state: Any, report: Report) -> tuple:
+    def gaps(state: Any, report: SessionInfo) -> tuple:
         expert = statistic.log_likelihood(mdp, expert_weights, expert_values, state.statistic)
         risk = excess_risk(mdp, expert_policy, visits, state.weights)
         return expert - report.log_likelihood, risk, state.weights

@@ -75,7 +75,7 @@ def size_for(error: float, delta: float, events: float) -> float:
 
 
 def error_for(size: float, delta: float, events: float) -> float:
-    """Error reached with ``size`` trajectories (or samples) for ``delta``; inverse of :func:`size_for`."""
+    """Error reached with ``size`` trajectories (or draws) for ``delta``; inverse of :func:`size_for`."""
     counted("size", size), counted("events", events)
     return math.sqrt(math.log(2 * events / probability("delta", delta)) / (2 * size))
 
@@ -124,7 +124,7 @@ def maximum_entropy_confidence(size: float, error: float, n_features: int, disco
 
 
 def lme_constraint_bound(
-    size: float, samples: float, epsilon: float, epsilon_s: float, n_features: int
+    size: float, draws: float, epsilon: float, epsilon_s: float, n_features: int
 ) -> Bound:
     """Lemma 2 (chapter 4), Lemma 6 (appendix B): constraint bounds for LME-I2RL.
 
@@ -136,7 +136,7 @@ def lme_constraint_bound(
     values in [0, 1], so that ``epsilon`` and ``delta`` alone suffice.
     """
     delta = failure_probability(size, epsilon, n_features)
-    delta_s = failure_probability(samples, epsilon_s, n_features)
+    delta_s = failure_probability(draws, epsilon_s, n_features)
     return Bound(
         "Lemma 2 (Lemma 6 of appendix B)",
         "(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + epsilon_s",
@@ -148,14 +148,14 @@ def lme_constraint_bound(
 
 
 def lme_i2rl_confidence(
-    size: float, samples: float, epsilon: float, epsilon_s: float, n_features: int, discount: float
+    size: float, draws: float, epsilon: float, epsilon_s: float, n_features: int, discount: float
 ) -> Bound:
     """Theorem 2 (chapter 4), Theorem 4 (appendix B): confidence for LME-I2RL.
 
     ``LL(theta_E) - LL(theta^i) <= 4 K epsilon_l / (1 - gamma)``, ``epsilon_l = (epsilon + epsilon_s) / 2``,
     with probability at least ``max(0, 1 - delta - delta_s)``. The program's slack is ``2 epsilon_l``.
     """
-    lemma = lme_constraint_bound(size, samples, epsilon, epsilon_s, n_features)
+    lemma = lme_constraint_bound(size, draws, epsilon, epsilon_s, n_features)
     return Bound(
         "Theorem 2 (Theorem 4 of appendix B)",
         "LL(theta_E) - LL(theta) <= 4 K epsilon_l / (1 - gamma)",
@@ -365,7 +365,7 @@ def demonstrations_needed(
 
     Every row is for the same log-likelihood error, Theorem 2's ``4 K epsilon_l / (1 - gamma)`` nats, with
     the same confidence; ``delta`` and ``delta_s`` share what is left of it equally. Rows differ in what they
-    use: ``theorem`` samples hidden steps and knows the features' range; ``exact completion`` does not
+    use: ``theorem`` draws hidden steps and knows the features' range; ``exact completion`` does not
     sample, so that ``epsilon_s`` and ``delta_s`` are spent on the trajectories; ``observed spread`` (a row
     for each of some standard deviations of the discounted averages ``(1 - gamma) f_k``, or one for the
     ``deviations [K]`` given) knows how much the features vary.
@@ -410,7 +410,7 @@ def table_7_1a(n_features: int = 6, delta: float = 0.1, discount: float = 0.99) 
     """
     rows = []
     for epsilon, epsilon_s in ((0.2, 0.05), (0.1, 0.05), (0.05, 0.05), (0.04, 0.05)):
-        size, samples = size_for(epsilon, delta, n_features), size_for(epsilon_s, delta, n_features)
+        size, draws = size_for(epsilon, delta, n_features), size_for(epsilon_s, delta, n_features)
         rows.append(
             {
                 "epsilon_l": round((epsilon + epsilon_s) / 2, 12),
@@ -418,7 +418,7 @@ def table_7_1a(n_features: int = 6, delta: float = 0.1, discount: float = 0.99) 
                 "epsilon_s": epsilon_s,
                 "trajectories": round(size),
                 "sufficient": math.ceil(size),
-                "draws": math.ceil(samples),
+                "draws": math.ceil(draws),
                 "error_nats": 2 * n_features * (epsilon + epsilon_s) / (1 - discounted(discount)),
             }
         )

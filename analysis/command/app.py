@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from rich.console import Console
 
     from ...inference.journal.journal import JournalView, SessionRecord
-    from ...models.observation.evidence import Imperfection
+    from ...models.observation.evidence import AnySensor
     from ...models.process.mdp import TabularMDP
 
 BROKEN_PIPE = 128 + 13
@@ -298,7 +298,7 @@ def run_sorting(
         int | None,
         _count("Sessions of the online learner; they end at the numbers above unless given."),
     ] = None,
-    ways: Annotated[int, _count("Ways that MME-MTIRL starts from: the most it can find.")] = 4,
+    n_components: Annotated[int, _count("Ways that MME-MTIRL starts from: the most it can find.")] = 4,
     steps: Annotated[int, _count("Steps of a trajectory.")] = 50,
     runs: Annotated[int, _count("Independent repetitions.")] = 3,
     belts: Annotated[int, _count("Simulated belts of Table 7.2.")] = 300,
@@ -313,7 +313,7 @@ def run_sorting(
     with _reported_errors(), _progress(as_json) as advance:
         study = sorting_study.sorting_study(
             tasks, sorting_study.counts_of(tasks, trajectories), runs=runs, seed=seed, sessions=sessions,
-            ways=ways, steps=steps, belts=belts, advance=advance,
+            n_components=n_components, steps=steps, belts=belts, advance=advance,
             methods=None if method is MultiTask.all else (method.value,),
         )  # fmt: skip
         sorting_report.write(study, report)
@@ -547,7 +547,7 @@ def show(
         if as_json:
             _print_sessions(view, last)
             return
-        _print_history(view, list(view.reports(10 if last is None else last)))
+        _print_history(view, list(view.records(10 if last is None else last)))
         if export is not None:
             print(f"Exported to {export}")
 
@@ -555,7 +555,7 @@ def show(
 def _print_sessions(view: JournalView, last: int | None) -> None:
     """One JSON object, a session a line, so that a long history is never held whole."""
     print(f'{{"origin": {json.dumps(plain(view.origin._asdict()))}, "sessions": [', end="")
-    for i, r in enumerate(view.reports(last)):
+    for i, r in enumerate(view.records(last)):
         fields = {
             "session": r.session,
             "committed": r.committed,
@@ -580,7 +580,7 @@ def _tell(teller: Any, study: Any, folder: Path, as_json: bool) -> None:
     print(printable(f"Report: {folder / 'index.html'}"))
 
 
-def _decision_process(name: str, observability: int | None) -> tuple[TabularMDP, Imperfection]:
+def _decision_process(name: str, observability: int | None) -> tuple[TabularMDP, AnySensor]:
     from ...models.observation.evidence import Sensor, Visibility
 
     if name in ("patrol1", "patrol2", "patrol3"):

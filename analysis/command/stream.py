@@ -16,7 +16,7 @@ from jaxtyping import Array
 
 from ...inference.journal.journal import Journal, JournalError, Position
 from ...inference.journal.locking import Identity
-from ...inference.sessions.learner import Learner, Report
+from ...inference.sessions.learner import Learner, SessionInfo
 from ...inference.sessions.serialization import demonstration_digest
 from ...models.observation.demonstration import (
     DEFAULT_LIMITS,
@@ -208,7 +208,7 @@ def learn_stream(
     size: int = 1,
     agent: int | None = None,
     source: str = "input",
-    on_session: Callable[[Report], None] | None = None,
+    on_session: Callable[[SessionInfo], None] | None = None,
     limits: LineLimits = DEFAULT_LIMITS,
     quarantine: Quarantine | None = None,
 ) -> int:

@@ -45,7 +45,7 @@ def policy_map(
     shape = (patrol.mdp.n_states, patrol.mdp.n_actions)
     if policy.shape != shape:
         raise ValueError(f"a policy of {patrol.name} has shape {shape}, got {policy.shape}")
-    view = None if observability is None else np.asarray(patrol.visibility(observability).presence) > 0
+    view = None if observability is None else np.asarray(patrol.visibility(observability).visibility) > 0
     optimal = np.asarray(optimal_actions(patrol.mdp, jnp.asarray(patrol.weights)))
     actions = break_ties(np.asarray(greedy_actions(jnp.asarray(policy)))).argmax(1)
     agrees = optimal[np.arange(len(actions)), actions]

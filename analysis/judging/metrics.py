@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float
 from ...inference.completion.smoothing import evidence_of, log_likelihoods
 from ...models.inputs.text import shortened
 from ...models.observation.demonstration import Demonstration
-from ...models.observation.evidence import Imperfection, checked_demonstration, fitting_sensor
+from ...models.observation.evidence import AnySensor, checked_demonstration, fitting_sensor
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import (
     deterministic_policy,
@@ -157,7 +157,7 @@ def evaluate(
 
 
 def demonstration_log_likelihoods(
-    mdp: TabularMDP, sensor: Imperfection, weights: Float[Array, " K"], demonstration: Demonstration
+    mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, " K"], demonstration: Demonstration
 ) -> Float[Array, " n"]:
     """Exact log-likelihood (nats) of each trajectory under the soft policy of ``weights``.
 
@@ -225,7 +225,7 @@ def _error(best: Float[Array, " S"], values: Float[Array, " S"]) -> LearningErro
 
 @jax.jit
 def _log_likelihoods(
-    mdp: TabularMDP, sensor: Imperfection, weights: Float[Array, " K"], demonstration: Demonstration
+    mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, " K"], demonstration: Demonstration
 ) -> Float[Array, " n"]:
     log_policy = soft_plan(mdp, reward_of(mdp, weights)).log_policy
     return log_likelihoods(mdp, log_policy, evidence_of(mdp, sensor, demonstration))

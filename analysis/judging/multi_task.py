@@ -65,7 +65,7 @@ def expected_value_difference(
     truth, found = (_weights(mdp, name, w) for name, w in (("true", true_weights), ("learned", learned)))
     n = demonstration.n_trajectories
     of_behaviour = _codes("labels", labels, n, len(truth))
-    of_way = _codes("assignments", assignments, n, len(found))
+    of_component = _codes("assignments", assignments, n, len(found))
     visits = _state_visits(mdp, checked_demonstration(mdp, demonstration))
     real = demonstration.lengths > 0
     if not real.any():
@@ -74,7 +74,7 @@ def expected_value_difference(
     room = 1 << (len(found) - 1).bit_length()
     padded = np.concatenate([found, np.broadcast_to(found[:1], (room - len(found), mdp.n_features))])
     loss = np.asarray(_losses(mdp, jnp.asarray(truth), jnp.asarray(padded)))
-    return float(np.sum(visits * loss[of_behaviour, of_way], axis=1)[real].mean())
+    return float(np.sum(visits * loss[of_behaviour, of_component], axis=1)[real].mean())
 
 
 @jax.jit
@@ -86,11 +86,11 @@ def _losses(
     def greedy(weights: Float[Array, " K"]) -> Float[Array, "S A"]:
         return deterministic_policy(hard_plan(mdp, reward_of(mdp, weights)).optimal)
 
-    ways = lax.map(greedy, learned)
+    components = lax.map(greedy, learned)
 
     def of_behaviour(weights: Float[Array, " K"]) -> Float[Array, "D S"]:
         # The expert's policy is evaluated like the others: equal policies then have equal values to the bit.
-        policies = jnp.concatenate([greedy(weights)[None], ways])
+        policies = jnp.concatenate([greedy(weights)[None], components])
         values = lax.map(lambda policy: policy_values(mdp, policy, reward_of(mdp, weights)), policies)
         return jnp.abs(values[0] - values[1:])
 
@@ -106,15 +106,15 @@ def assignment_accuracy(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarr
     return float(table[linear_sum_assignment(table, maximize=True)].sum() / table.sum())
 
 
-def match_ways(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> dict[int, int]:
+def match_components(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> dict[int, int]:
     """Which way is which behaviour: from behaviours to ways, one to one, with most trajectories in common.
 
     A behaviour is missing where no way is left for it that has any of its trajectories. Errors as for
     :func:`assignment_accuracy`.
     """
-    table, behaviours, ways = _contingency(labels, assignments)
+    table, behaviours, components = _contingency(labels, assignments)
     pairs = zip(*linear_sum_assignment(table, maximize=True), strict=True)
-    return {int(behaviours[b]): int(ways[d]) for b, d in pairs if table[b, d]}
+    return {int(behaviours[b]): int(components[d]) for b, d in pairs if table[b, d]}
 
 
 def adjusted_rand_index(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> float:
@@ -130,11 +130,11 @@ def adjusted_rand_index(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarr
     def pairs(counts: Int[np.ndarray, "..."]) -> float:
         return float(np.sum(counts * (counts - 1)) / 2)
 
-    in_behaviours, in_ways, total = pairs(table.sum(1)), pairs(table.sum(0)), pairs(table.sum())
-    if in_behaviours == in_ways and in_behaviours in (0.0, total):
+    in_behaviours, in_components, total = pairs(table.sum(1)), pairs(table.sum(0)), pairs(table.sum())
+    if in_behaviours == in_components and in_behaviours in (0.0, total):
         return 1.0
-    chance = in_behaviours * in_ways / total
-    return (pairs(table) - chance) / ((in_behaviours + in_ways) / 2 - chance)
+    chance = in_behaviours * in_components / total
+    return (pairs(table) - chance) / ((in_behaviours + in_components) / 2 - chance)
 
 
 def _contingency(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> tuple:
@@ -146,10 +146,10 @@ def _contingency(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n
             f"{labels.shape} and {assignments.shape}"
         )
     behaviours, row = np.unique(labels, return_inverse=True)
-    ways, column = np.unique(assignments, return_inverse=True)
-    table = np.zeros((len(behaviours), len(ways)), int)
+    components, column = np.unique(assignments, return_inverse=True)
+    table = np.zeros((len(behaviours), len(components)), int)
     np.add.at(table, (row, column), 1)
-    return table, behaviours, ways
+    return table, behaviours, components
 
 
 def _weights(mdp: TabularMDP, which: str, weights: Float[np.ndarray, "D K"]) -> Float[np.ndarray, "D K"]:
@@ -159,10 +159,10 @@ def _weights(mdp: TabularMDP, which: str, weights: Float[np.ndarray, "D K"]) -> 
             f"{which} weights must have shape [ways, {mdp.n_features}], at least one way, got {weights.shape}"
         )
     if not np.isfinite(weights).all():
-        way, k = np.argwhere(~np.isfinite(weights))[0]
+        component, k = np.argwhere(~np.isfinite(weights))[0]
         raise ValueError(
-            f"the {which} weight of feature {shortened(mdp.feature_names[k])} in way {way} is "
-            f"{weights[way, k]}, not a number"
+            f"the {which} weight of feature {shortened(mdp.feature_names[k])} in way {component} is "
+            f"{weights[component, k]}, not a number"
         )
     return weights
 

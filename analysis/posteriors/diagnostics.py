@@ -32,7 +32,7 @@ from ...inference.posteriors.weights import (
 )
 from ...models.inputs.arguments import as_key
 from ...models.observation.demonstration import PAD, UNKNOWN, Demonstration
-from ...models.observation.evidence import Imperfection, checked_demonstration, require_possible
+from ...models.observation.evidence import AnySensor, checked_demonstration, require_possible
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted
 from .history import provenance
@@ -45,7 +45,7 @@ class InferenceDataError(ValueError):
 def require_posterior(
     idata: az.InferenceData,
     mdp: TabularMDP | None = None,
-    sensor: Imperfection | None = None,
+    sensor: AnySensor | None = None,
     *,
     extra: tuple[str, ...] = (),
 ) -> xr.DataArray:
@@ -152,7 +152,7 @@ def _by_session(idata: az.InferenceData) -> tuple[str, ...]:
 def posterior_by_session(
     key: Array,
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     demonstration: Demonstration,
     at: Sequence[int],
     *,

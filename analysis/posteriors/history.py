@@ -20,7 +20,7 @@ import xarray as xr
 from jax import lax
 from jaxtyping import Array, Float
 
-from ...inference.sessions.learner import Learner, Report
+from ...inference.sessions.learner import Learner, SessionInfo
 from ...inference.sessions.running import Run
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import reward_of, soft_plan
@@ -61,7 +61,7 @@ def _plain(value: object) -> object:
 
 def run_history(
     learner: Learner,
-    run: Run | Sequence[Report],
+    run: Run | Sequence[SessionInfo],
     *,
     statistic: Any = None,
     seed: int | None = None,
@@ -98,15 +98,15 @@ def run_history(
     ValueError
         For no reports, for reports of a fleet, and for weights that do not fit the learner's MDP.
     """
-    reports, statistic = _reports(run), _statistic_of(run) if statistic is None else statistic
-    if np.ndim(reports[0].session) > 0:
+    infos, statistic = _infos(run), _statistic_of(run) if statistic is None else statistic
+    if np.ndim(infos[0].session) > 0:
         raise ValueError("these are reports of a fleet, an array for each field: use fleet_history")
-    return _history(learner, reports, (), statistic, seed, true_weights)
+    return _history(learner, infos, (), statistic, seed, true_weights)
 
 
 def fleet_history(
     learner: Learner,
-    reports: Sequence[Report],
+    infos: Sequence[SessionInfo],
     *,
     state: Any = None,
     seed: int | None = None,
@@ -114,33 +114,33 @@ def fleet_history(
 ) -> az.InferenceData:
     """The sessions of a fleet: as :func:`run_history`, with a leading dimension ``run``, one entry a stream.
 
-    ``reports`` are those of consecutive updates of :func:`~i2rl.inference.sessions.fleets.fleet`, ``state``
+    ``infos`` are those of consecutive updates of :func:`~i2rl.inference.sessions.fleets.fleet`, ``state``
     is the fleet's last state. Raises ``ValueError`` as there, and for reports of a single learner.
     """
-    reports = _reports(reports)
-    if np.ndim(reports[0].session) != 1:
+    infos = _infos(infos)
+    if np.ndim(infos[0].session) != 1:
         raise ValueError("these are reports of a single learner: use run_history")
-    return _history(learner, reports, ("run",), getattr(state, "statistic", None), seed, true_weights)
+    return _history(learner, infos, ("run",), getattr(state, "statistic", None), seed, true_weights)
 
 
-def _reports(run: Run | Sequence[Report]) -> Sequence[Report]:
+def _infos(run: Run | Sequence[SessionInfo]) -> Sequence[SessionInfo]:
     # A report is itself a tuple: of numbers, none of which is a report.
-    reports = run.reports if isinstance(run, Run) else run
-    if not len(reports):
+    infos = run.infos if isinstance(run, Run) else run
+    if not len(infos):
         raise ValueError("a history needs at least one session, got no reports")
-    if not all(hasattr(report, "weights") for report in reports):
-        kinds = sorted({type(report).__name__ for report in reports})
+    if not all(hasattr(info, "weights") for info in infos):
+        kinds = sorted({type(info).__name__ for info in infos})
         raise ValueError(f"a history is made from a run or a list of reports, got {', '.join(kinds)}")
-    return reports
+    return infos
 
 
-def _statistic_of(run: Run | Sequence[Report]) -> Any:
+def _statistic_of(run: Run | Sequence[SessionInfo]) -> Any:
     return getattr(run.state, "statistic", None) if isinstance(run, Run) else None
 
 
 def _history(
     learner: Learner,
-    reports: Sequence[Report],
+    infos: Sequence[SessionInfo],
     streams: tuple[str, ...],
     statistic: Any,
     seed: int | None,
@@ -148,8 +148,8 @@ def _history(
 ) -> az.InferenceData:
     mdp = learner.mdp
     columns = {
-        name: np.stack([np.asarray(getattr(report, name)) for report in reports], axis=len(streams))
-        for name in reports[0]._fields
+        name: np.stack([np.asarray(getattr(info, name)) for info in infos], axis=len(streams))
+        for name in infos[0]._fields
     }
     weights, n = columns["weights"], len(streams) + 1
     if weights.shape[n:] != (mdp.n_features,):
@@ -157,7 +157,7 @@ def _history(
             f"weights of a session of {learner.name} must have shape {(mdp.n_features,)}, "
             f"one for each feature, got {weights.shape[n:]}"
         )
-    numbers = columns.pop("session").reshape(-1, len(reports))[0]
+    numbers = columns.pop("session").reshape(-1, len(infos))[0]
     coords: dict[str, Any] = {
         "session": numbers, "feature": list(mdp.feature_names), "state": list(mdp.state_names),
         "action": list(mdp.action_names),

@@ -29,7 +29,7 @@ from ...inference.completion.smoothing import evidence_of, smooth_all
 from ...inference.posteriors.weights import gather, posterior_mode
 from ...models.observation.demonstration import SEEN, Demonstration
 from ...models.observation.evidence import (
-    Imperfection,
+    AnySensor,
     checked_demonstration,
     fitting_sensor,
     require_possible,
@@ -95,7 +95,7 @@ class Identifiability(NamedTuple):
 
 @jax.jit
 def _shown(
-    weights: Float[Array, " K"], mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration
+    weights: Float[Array, " K"], mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration
 ) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
     """Expected visits of each state, at all steps and at the steps that were seen."""
     evidence = evidence_of(mdp, sensor, demonstration)
@@ -106,7 +106,7 @@ def _shown(
 
 def identifiability_of(
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     demonstration: Demonstration,
     weights: Float[Array, " K"] | None = None,
     *,

@@ -23,7 +23,7 @@ from jaxtyping import Array, Float
 from ...inference.completion.smoothing import evidence_of, log_likelihoods
 from ...models.laws.trajectory import TrajectoryLaw, sample_demonstration
 from ...models.observation.demonstration import Demonstration
-from ...models.observation.evidence import Imperfection, checked_demonstration, fitting_sensor
+from ...models.observation.evidence import AnySensor, checked_demonstration, fitting_sensor
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import features_to_go, reward_of, soft_plan
 
@@ -52,14 +52,14 @@ def complete_information(
 
 
 def _log_likelihoods(
-    weights: Float[Array, " K"], mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration
+    weights: Float[Array, " K"], mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration
 ) -> Float[Array, " n"]:
     log_policy = soft_plan(mdp, reward_of(mdp, weights)).log_policy
     return log_likelihoods(mdp, log_policy, evidence_of(mdp, sensor, demonstration))
 
 
 def _total(
-    weights: Float[Array, " K"], mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration
+    weights: Float[Array, " K"], mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration
 ) -> Float[Array, ""]:
     return jnp.sum(_log_likelihoods(weights, mdp, sensor, demonstration))
 
@@ -68,7 +68,7 @@ _scores = jax.jit(jax.jacfwd(_log_likelihoods))
 _hessian = jax.jit(jax.jacfwd(jax.grad(_total)))
 
 
-def _given(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> tuple:
+def _given(mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration) -> tuple:
     checked = checked_demonstration(mdp, demonstration)
     return mdp, fitting_sensor(sensor, mdp), checked.bucketed()
 
@@ -79,14 +79,14 @@ def _along(weights: Float[Array, "W K"], *given: Any) -> Float[Array, " W"]:
 
 
 def total_log_likelihoods(
-    mdp: TabularMDP, sensor: Imperfection, weights: Float[Array, "W K"], demonstration: Demonstration
+    mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, "W K"], demonstration: Demonstration
 ) -> Float[np.ndarray, " W"]:
     """Exact log-likelihood (nats) of the whole demonstration under each of several weights."""
     return np.asarray(_along(jnp.asarray(weights, float), *_given(mdp, sensor, demonstration)))
 
 
 def scores(
-    mdp: TabularMDP, sensor: Imperfection, weights: Float[Array, " K"], demonstration: Demonstration
+    mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, " K"], demonstration: Demonstration
 ) -> Float[np.ndarray, "n K"]:
     """Gradient of each trajectory's exact log-likelihood, hidden steps summed out."""
     gradients = _scores(jnp.asarray(weights, float), *_given(mdp, sensor, demonstration))
@@ -94,7 +94,7 @@ def scores(
 
 
 def observed_information(
-    mdp: TabularMDP, sensor: Imperfection, weights: Float[Array, " K"], demonstration: Demonstration
+    mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, " K"], demonstration: Demonstration
 ) -> Float[np.ndarray, "K K"]:
     """Minus the Hessian of the demonstration's exact log-likelihood, hidden steps summed out.
 
@@ -108,7 +108,7 @@ def observed_information(
 def expected_information(
     key: Array,
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     weights: Float[Array, " K"],
     trajectories: int,
     length: int,

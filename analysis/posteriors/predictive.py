@@ -13,7 +13,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ...models.observation.demonstration import LOST, PAD, SEEN, UNKNOWN, Demonstration
-from ...models.observation.evidence import Imperfection, fitting_sensor, observe
+from ...models.observation.evidence import AnySensor, fitting_sensor, observe
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import finite_occupancy, reward_of, simulate, soft_plan
 from .diagnostics import InferenceDataError, require_posterior
@@ -23,7 +23,7 @@ def predictive_visits(
     key: Array,
     idata: az.InferenceData,
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     demonstration: Demonstration | None = None,
 ) -> az.InferenceData:
     """Add what the posterior predicts of how often each state is seen.
@@ -103,7 +103,7 @@ def _replicate(
     keys: Array,
     weights: Float[Array, "D K"],
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     counted: Bool[Array, "n L"],
 ) -> tuple[Float[Array, "D S"], Float[Array, "D S"]]:
     """Simulated and exactly expected counts of the steps seen in each state, for every draw."""
@@ -128,16 +128,16 @@ def _replicate(
 
 
 def _expected_visits(
-    mdp: TabularMDP, policy: Float[Array, "S A"], sensor: Imperfection, steps: Array
+    mdp: TabularMDP, policy: Float[Array, "S A"], sensor: AnySensor, steps: Array
 ) -> Float[Array, " S"]:
     """Expected number of steps seen in each state, ``steps [L]`` being how many are counted at each time."""
     pairs = finite_occupancy(mdp, jnp.broadcast_to(policy, (len(steps), *policy.shape)))
     total = jnp.einsum("t,tsa->sa", steps, pairs)
-    if sensor.presence is not None:
-        total = total * sensor.presence[:, None]
-    if sensor.reading is None:
+    if sensor.visibility is not None:
+        total = total * sensor.visibility[:, None]
+    if sensor.noise is None:
         return jnp.sum(total, axis=1)
-    return jnp.einsum("sa,saop->o", total, jnp.exp(sensor.reading.log_probabilities))
+    return jnp.einsum("sa,saop->o", total, jnp.exp(sensor.noise.log_probabilities))
 
 
 def predictive_check(idata: az.InferenceData, coverage: float = 0.9) -> xr.Dataset:

@@ -26,7 +26,7 @@ from jaxtyping import Array, Float
 from ...inference.posteriors.weights import sample_posterior
 from ...models.inputs.text import listed, shortened
 from ...models.observation.demonstration import LOST, PAD, Demonstration
-from ...models.observation.evidence import Imperfection
+from ...models.observation.evidence import AnySensor
 from ...models.process.mdp import Labels, TabularMDP
 
 # Above this the importance weights of a trajectory left out are too uneven to be relied on.
@@ -99,7 +99,7 @@ def select_features(mdp: TabularMDP, names: Sequence[str]) -> TabularMDP:
 def compare_features(
     key: Array,
     mdps: Mapping[str, TabularMDP],
-    sensor: Imperfection,
+    sensor: AnySensor,
     demonstration: Demonstration,
     **options: Any,
 ) -> FeatureComparison:

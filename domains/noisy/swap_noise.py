@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ...models.inputs.arguments import concrete, is_traced, rebuilt_unchecked
-from ...models.observation.evidence import Imperfection, ObservationModel, Sensor
+from ...models.observation.evidence import AnySensor, ObservationModel, Sensor
 
 
 class _SwapFields(NamedTuple):
     swaps: Int[Array, "M S A"]
-    noise: Float[Array, " M"]
+    chances: Float[Array, " M"]
 
 
 @rebuilt_unchecked
@@ -27,7 +27,7 @@ class SwapNoise(_SwapFields):
         What each confusion takes a pair for, as the flat index ``s * A + a``; the pair itself where it has
         nothing to confuse. Each is its own inverse, their order does not matter, and different ones applied
         to a pair give different reports.
-    noise : float ``[M]``
+    chances : float ``[M]``
         Probability of each, where it has something to confuse.
 
     Raises
@@ -38,10 +38,10 @@ class SwapNoise(_SwapFields):
 
     __slots__ = ()
 
-    def __new__(cls, swaps: np.ndarray | Array, noise: np.ndarray | Array) -> SwapNoise:
+    def __new__(cls, swaps: np.ndarray | Array, chances: np.ndarray | Array) -> SwapNoise:
         """Check and convert; see the class."""
         flat = jnp.asarray(swaps if is_traced(swaps) else _checked_swaps(np.asarray(swaps)))
-        p = concrete("noise", noise)
+        p = concrete("chances", chances)
         if p is not None:
             if p.shape != flat.shape[:1]:
                 raise ValueError(
@@ -51,14 +51,14 @@ class SwapNoise(_SwapFields):
                 raise ValueError(
                     f"the noise of a swap is a probability in [0, 1]; that of swap {m} is {p[m]}"
                 )
-        return super().__new__(cls, flat, jnp.asarray(noise if p is None else p, float))
+        return super().__new__(cls, flat, jnp.asarray(chances if p is None else p, float))
 
-    def __mul__(self, other: Imperfection) -> Sensor:  # type: ignore[override]
+    def __mul__(self, other: AnySensor) -> Sensor:  # type: ignore[override]
         """Compose with another imperfection, such as a :class:`Visibility`."""
-        return self.reading * other
+        return self.noise * other
 
     @property
-    def presence(self) -> None:
+    def visibility(self) -> None:
         """Noise hides nothing."""
         return None
 
@@ -68,11 +68,11 @@ class SwapNoise(_SwapFields):
         return self.swaps != jnp.arange(self.swaps[0].size).reshape(self.swaps.shape[1:])
 
     @property
-    def reading(self) -> ObservationModel:
+    def noise(self) -> ObservationModel:
         """``O(o | g)``: the report is the truth with a random subset of the swaps applied."""
-        shape, (m, size) = self.swaps.shape[1:], self.swaps.reshape(len(self.noise), -1).shape
+        shape, (m, size) = self.swaps.shape[1:], self.swaps.reshape(len(self.chances), -1).shape
         chosen = _subsets(m)
-        weights = jnp.prod(jnp.where(chosen, self.noise, 1 - self.noise), axis=1)
+        weights = jnp.prod(jnp.where(chosen, self.chances, 1 - self.chances), axis=1)
         table = jnp.zeros((size, size))
         for weight, report in zip(weights, self._reports(), strict=True):
             table = table.at[jnp.arange(size), report].add(weight)
@@ -81,12 +81,12 @@ class SwapNoise(_SwapFields):
     def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
         """Which swaps turned each truth into its report (flat indices); none where no swaps do."""
         # The first subset that explains a report holds no swap without effect.
-        return jnp.asarray(_subsets(len(self.noise)))[(self._reports()[:, truth] == report).argmax(0)]
+        return jnp.asarray(_subsets(len(self.chances)))[(self._reports()[:, truth] == report).argmax(0)]
 
     def _reports(self) -> Int[Array, "2**M S*A"]:
-        flat = self.swaps.reshape(len(self.noise), -1)
+        flat = self.swaps.reshape(len(self.chances), -1)
         reports = []
-        for subset in _subsets(len(self.noise)):
+        for subset in _subsets(len(self.chances)):
             report = jnp.arange(flat.shape[1])
             for m in np.flatnonzero(subset):
                 report = flat[m][report]

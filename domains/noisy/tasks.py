@@ -30,8 +30,8 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...models.observation.demonstration import SEEN, Demonstration
 from ...models.observation.evidence import (
+    AnySensor,
     FeatureNoise,
-    Imperfection,
     ObservationModel,
     Sensor,
     Visibility,
@@ -228,7 +228,7 @@ def feature_noise(task: NoisyTask, confused: float = 1 - SWAP, clear: float = 0.
     with every predicate right is often of another pair than the truth.
     """
     psi = task.predicates.reshape(len(task.predicates), -1)
-    changes = (psi[:, np.asarray(task.noise.swaps).reshape(len(task.noise.noise), -1)] != psi[:, None]).any(
+    changes = (psi[:, np.asarray(task.noise.swaps).reshape(len(task.noise.chances), -1)] != psi[:, None]).any(
         (1, 2)
     )
     return FeatureNoise(task.predicates, np.where(changes, confused, clear))
@@ -261,7 +261,7 @@ def _stationary(mdp: TabularMDP, policy: Float[np.ndarray, "S A"]) -> Float[np.n
 
 
 def agreement_probabilities(
-    noise: Imperfection, predicates: np.ndarray | Array, weights: np.ndarray | Array
+    noise: AnySensor, predicates: np.ndarray | Array, weights: np.ndarray | Array
 ) -> Float[np.ndarray, " J"]:
     """Probability that a predicate of a report is that of the truth, when truths occur as ``weights [S, A]``.
 
@@ -288,10 +288,10 @@ def agreement_probabilities(
     return np.clip(same, 0.0, 1.0)
 
 
-def _reading(noise: Imperfection) -> ObservationModel:
-    if noise.reading is None:
+def _reading(noise: AnySensor) -> ObservationModel:
+    if noise.noise is None:
         raise ValueError("this imperfection has no observation model: it reports what is in view exactly")
-    return noise.reading
+    return noise.noise
 
 
 # -- demonstrations -----------------------------------------------------------------------------------
@@ -318,7 +318,7 @@ class NoisyDemonstration(NamedTuple):
 def demonstrate_noisy(
     key: Array,
     task: NoisyTask,
-    noise: Imperfection | None = None,
+    noise: AnySensor | None = None,
     *,
     sessions: int,
     trajectories: int = 2,
@@ -360,10 +360,10 @@ def demonstrate_noisy(
         raise ValueError(f"the concentration of the clarity must be positive, got {concentration}")
     noise = task.noise if noise is None else noise
     mdp, model = task.starting(starts), _reading(noise)
-    presence = noise.presence
+    visibility = noise.visibility
     if view is not None:
-        presence = view.presence if presence is None else presence * view.presence
-    sensor = fitting_sensor(Sensor(presence, model), mdp)
+        visibility = view.visibility if visibility is None else visibility * view.visibility
+    sensor = fitting_sensor(Sensor(visibility, model), mdp)
     if scores == "product":
         if reliabilities is None:
             reliabilities = (
@@ -402,7 +402,7 @@ _looks = jax.jit(jax.vmap(observe, in_axes=(0, None, 0, 0)))
 
 def _clarity(
     key: Array,
-    noise: Imperfection,
+    noise: AnySensor,
     truth: Int[np.ndarray, "n L"],
     report: Int[np.ndarray, "n L"],
     concentration: float,
@@ -411,8 +411,8 @@ def _clarity(
     g, o = truth.reshape(-1), report.reshape(-1)
     if isinstance(noise, SwapNoise):
         wrong = np.asarray(noise.confused(jnp.asarray(g), jnp.asarray(o)))
-        acts = np.asarray(noise.acts).reshape(len(noise.noise), -1).T
-        chance = np.where(acts[g], np.asarray(noise.noise), 0.0)
+        acts = np.asarray(noise.acts).reshape(len(noise.chances), -1).T
+        chance = np.where(acts[g], np.asarray(noise.chances), 0.0)
     else:
         table = np.exp(np.asarray(_reading(noise).log_probabilities))
         table = table.reshape(table.shape[0] * table.shape[1], -1)

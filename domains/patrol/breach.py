@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...models.laws.chain import condition
 from ...models.observation.demonstration import HIDDEN, LOST
-from ...models.observation.evidence import Imperfection, step_log_evidence
+from ...models.observation.evidence import AnySensor, step_log_evidence
 from ...models.process.mdp import TabularMDP
 from .process import Breach, Interaction, Patrol, cell_ahead, simulate_patrollers
 
@@ -125,7 +125,7 @@ def _breach_of(patrol: Patrol) -> Breach:
 def watch(
     mdp: TabularMDP,
     log_policy: Float[Array, "S A"],
-    sensor: Imperfection,
+    sensor: AnySensor,
     belief: Float[Array, " S"],
     code: Int[Array, " 3"],
 ) -> Float[Array, " S"]:
@@ -148,7 +148,7 @@ def watch(
 def project(
     mdp: TabularMDP,
     log_policy: Float[Array, "S A"],
-    sensor: Imperfection,
+    sensor: AnySensor,
     belief: Float[Array, " S"],
     code: Int[Array, " 3"],
 ) -> Float[Array, " S"]:
@@ -161,14 +161,14 @@ def project(
 
 
 Watcher = Callable[
-    [TabularMDP, Float[Array, "S A"], Imperfection, Float[Array, " S"], Int[Array, " 3"]], Float[Array, " S"]
+    [TabularMDP, Float[Array, "S A"], AnySensor, Float[Array, " S"], Int[Array, " 3"]], Float[Array, " S"]
 ]
 
 
 def current_beliefs(
     mdp: TabularMDP,
     log_policies: Float[Array, "P S A"],
-    sensor: Imperfection,
+    sensor: AnySensor,
     codes: Int[Array, "P L 3"],
     watcher: Watcher = watch,
 ) -> Float[Array, "P S"]:

@@ -84,7 +84,7 @@ class AdversarialState(NamedTuple):
     optimiser : state of the discriminator's optimiser
     generator : state of the generator, with its ``policy``
     replay : Transitions, generated in the last rounds, ``[K, B, ...]``
-    rounds, pairs : int; rounds of training and reported pairs so far
+    iterations, pairs : int; rounds of training and reported pairs so far
     sensor : the truth's
     """
 
@@ -94,7 +94,7 @@ class AdversarialState(NamedTuple):
     optimiser: Any
     generator: Any
     replay: Transitions
-    rounds: Int[Array, ""]
+    iterations: Int[Array, ""]
     pairs: Int[Array, ""]
     sensor: Any
 
@@ -105,7 +105,7 @@ class AdversarialState(NamedTuple):
         return np.concatenate([np.ravel(x) for x in jax.tree.leaves(parameters)])
 
 
-class AdversarialReport(NamedTuple):
+class AdversarialInfo(NamedTuple):
     """What a session did.
 
     Fields
@@ -114,16 +114,16 @@ class AdversarialReport(NamedTuple):
     log_likelihood : float
         Of the expert's actions under the generator's policy, nats a step, averaged over the truth's samples
         of the session's last round.
-    loss, expert_accuracy, generated_accuracy : float ``[rounds]``
+    loss, expert_accuracy, generated_accuracy : float ``[iterations]``
         Of the discriminator: cross-entropy in nats, and the shares told right.
-    returns : float ``[rounds]``
+    returns : float ``[iterations]``
         Mean return, by the environment's own reward, of the episodes that the generator finished; NaN where
         none ended. Learning never sees it.
     pairs, environment_steps : int
         Reported pairs, and steps of the generator, in all sessions so far.
     iterations : int
         Rounds of this session.
-    samplings : int ``[k]``
+    draws : int ``[k]``
         Of the truth, in each look at it.
     sensor : the truth's sensor after the session
     seconds : float
@@ -139,7 +139,7 @@ class AdversarialReport(NamedTuple):
     pairs: int
     environment_steps: int
     iterations: int
-    samplings: Int[np.ndarray, " k"]
+    draws: Int[np.ndarray, " k"]
     sensor: Any
     seconds: float
     weights: Float[np.ndarray, " P"]
@@ -150,7 +150,7 @@ class AdversarialTraining(NamedTuple):
 
     Fields
     ------
-    rounds : int, of generator and discriminator, in a session
+    iterations : int, of generator and discriminator, in a session
     updates : int, of the discriminator in a round
     batch : int, expert steps (and as many generated ones) an update
     learning_rate : float, of the discriminator's Adam
@@ -162,10 +162,10 @@ class AdversarialTraining(NamedTuple):
         A look samples on until the average logit of a step moves by no more
         (:func:`~i2rl.inference.adversarial.truth.look`). The dissertation's ``delta_G`` is a sum over a
         batch: its .1 over 256 steps is 4e-4 here.
-    samplings : int, the most in a look
+    draws : int, the most in a look
     """
 
-    rounds: int = 10
+    iterations: int = 10
     updates: int = 4
     batch: int = 256
     learning_rate: float = 1e-3
@@ -174,11 +174,11 @@ class AdversarialTraining(NamedTuple):
     replay: int = 1
     refresh: int = 5
     change: float = np.inf
-    samplings: int = 20
+    draws: int = 20
 
     def checked(self) -> AdversarialTraining:
         """Itself. Raises ``ValueError`` naming a field that cannot be."""
-        for name in ("rounds", "updates", "batch", "replay", "refresh", "samplings"):
+        for name in ("iterations", "updates", "batch", "replay", "refresh", "draws"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if not self.learning_rate > 0:
@@ -234,30 +234,30 @@ def adversarial(
         parts = (network, start(network), acting, blank, zero, zero, truth.prior())
         return AdversarialState(zero, k_rest, *parts)
 
-    def update(state: AdversarialState, recording: Recording) -> tuple[AdversarialState, AdversarialReport]:
+    def update(state: AdversarialState, recording: Recording) -> tuple[AdversarialState, AdversarialInfo]:
         began = time.perf_counter()
         task.require(recording)
         key, k_chain = jax.random.split(state.key)
         network, memory, acting = state.network, state.optimiser, state.generator
-        replay, sensor, rounds = state.replay, state.sensor, int(state.rounds)
+        replay, sensor, iterations = state.replay, state.sensor, int(state.iterations)
         chain = truth.begin(recording, sensor, k_chain)
         losses: list[Losses] = []
         returns: list[float] = []
-        samplings: list[int] = []
+        draws: list[int] = []
         expert: ExpertTransitions | None = None
-        for r in range(how.rounds):
+        for r in range(how.iterations):
             key, k_truth, k_updates = jax.random.split(key, 3)
             policy = acting.policy
             if expert is None or r % how.refresh == 0:
                 logits = partial(logits_of, network, policy)
                 chain, expert, made = look(
-                    truth, chain, sensor, policy, k_truth, task.actions, logits, how.change, how.samplings
+                    truth, chain, sensor, policy, k_truth, task.actions, logits, how.change, how.draws
                 )
-                samplings.append(made)
+                draws.append(made)
             before = acting.running
             acting, rollout = generator.collect(acting)
-            replay = remembered(replay, _steps(task, rollout), (rounds + r) % how.replay)
-            filled = min(rounds + r + 1, how.replay)
+            replay = remembered(replay, _steps(task, rollout), (iterations + r) % how.replay)
+            filled = min(iterations + r + 1, how.replay)
             network, memory, met = trained(network, memory, policy, expert, replay, filled, k_updates)
             acting = generator.improve(acting, rollout, rewarded(network, policy, rollout))
             losses.append(met)
@@ -266,7 +266,7 @@ def adversarial(
         assert expert is not None
         sensor = truth.learned(chain, sensor)
         pairs = state.pairs + int(np.sum(recording.live))
-        rounds += how.rounds
+        iterations += how.iterations
         state = AdversarialState(
             state.session + 1,
             key,
@@ -274,11 +274,11 @@ def adversarial(
             memory,
             acting,
             replay,
-            jnp.asarray(rounds),
+            jnp.asarray(iterations),
             pairs,
             sensor,
         )
-        return state, session_report(state, expert, losses, returns, began, samplings)
+        return state, session_info(state, expert, losses, returns, began, draws)
 
     settings = {**identity(generator, discriminator), **how._asdict(), **dict(configuration or {})}
     return Learner(name, task, settings, init, update)  # type: ignore[arg-type]
@@ -310,25 +310,25 @@ def action_log_likelihood(policy: Policy, expert: ExpertTransitions) -> Float[Ar
     return jnp.sum(jnp.where(expert.live, each, 0)) / jnp.sum(expert.live)
 
 
-def session_report(
+def session_info(
     state: AdversarialState,
     expert: ExpertTransitions,
     losses: Sequence[Losses],
     returns: Sequence[float],
     began: float,
-    samplings: Sequence[int] = (1,),
-) -> AdversarialReport:
+    draws: Sequence[int] = (1,),
+) -> AdversarialInfo:
     """What a session did, from the state after it, its last look at the expert, and its rounds' measures."""
     every: Losses = jax.tree.map(lambda *x: np.asarray(x, np.float64), *losses)
-    return AdversarialReport(
+    return AdversarialInfo(
         session=int(state.session),
         log_likelihood=float(action_log_likelihood(state.generator.policy, expert)),
         **every._asdict(),
         returns=np.asarray(returns, np.float64),
         pairs=int(state.pairs),
-        environment_steps=int(state.rounds) * int(np.prod(state.replay.terminated.shape[1:])),
+        environment_steps=int(state.iterations) * int(np.prod(state.replay.terminated.shape[1:])),
         iterations=len(losses),
-        samplings=np.asarray(samplings),
+        draws=np.asarray(draws),
         sensor=jax.tree.map(np.asarray, state.sensor),
         seconds=time.perf_counter() - began,
         weights=state.weights,

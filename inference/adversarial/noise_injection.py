@@ -34,13 +34,13 @@ from ...models.observation.recordings import Recording
 from ..sessions.learner import Learner
 from .discriminator import Discriminator, Losses, Transitions, cross_entropy
 from .learner import (
-    AdversarialReport,
+    AdversarialInfo,
     AdversarialState,
     Task,
     blank_steps,
     identity,
     remembered,
-    session_report,
+    session_info,
 )
 from .policy_optimisation import PPO, PPOState
 from .rollouts import Running, finished_returns, roll_out
@@ -215,7 +215,7 @@ class NoisyTraining(NamedTuple):
 
     Fields
     ------
-    rounds : int, of generator and discriminator, in a session
+    iterations : int, of generator and discriminator, in a session
     updates : int, of the discriminator in a round
     batch : int, expert steps (and as many generated ones) an update
     learning_rate : float, of the discriminator's Adam
@@ -226,7 +226,7 @@ class NoisyTraining(NamedTuple):
     shown : "intended" (as released) or "executed", the action that the discriminator sees and weighs
     """
 
-    rounds: int = 10
+    iterations: int = 10
     updates: int = 10
     batch: int = 32
     learning_rate: float = 1e-3
@@ -236,7 +236,7 @@ class NoisyTraining(NamedTuple):
 
     def checked(self, environments: int) -> NoisyTraining:
         """Itself. Raises ``ValueError`` naming a field that cannot be."""
-        for name in ("rounds", "updates", "batch", "replay"):
+        for name in ("iterations", "updates", "batch", "replay"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.shown not in SHOWN:
@@ -289,26 +289,26 @@ def noisy_airl(
             optimiser=start(network),
             generator=agent.init(k_agent),
             replay=blank_steps(task, (how.replay, size)),
-            rounds=zero,
+            iterations=zero,
             pairs=zero,
             sensor=(),
         )
 
-    def update(state: AdversarialState, recording: Recording) -> tuple[AdversarialState, AdversarialReport]:
+    def update(state: AdversarialState, recording: Recording) -> tuple[AdversarialState, AdversarialInfo]:
         began = time.perf_counter()
         task.require(recording)
         expert = within_bounds(task.actions, reported_steps(recording))
         key, network, memory = state.key, state.network, state.optimiser
-        acting, replay, rounds = state.generator, state.replay, int(state.rounds)
+        acting, replay, iterations = state.generator, state.replay, int(state.iterations)
         losses, returns = [], []
-        for _ in range(how.rounds):
+        for _ in range(how.iterations):
             key, k_collect, k_updates = jax.random.split(key, 3)
             before = acting.running
             acting, noisy = _acted(agent, acting, levels, k_collect)
-            replay = remembered(replay, noisy.steps(how.shown), rounds % how.replay)
-            rounds += 1
+            replay = remembered(replay, noisy.steps(how.shown), iterations % how.replay)
+            iterations += 1
             network, memory, last = trained(
-                network, memory, acting.policy, expert, replay, min(rounds, how.replay), k_updates
+                network, memory, acting.policy, expert, replay, min(iterations, how.replay), k_updates
             )
             acting = agent.improve(acting, noisy.rollout, rewarded(network, acting.policy, noisy))
             losses.append(last)
@@ -321,11 +321,11 @@ def noisy_airl(
             optimiser=memory,
             generator=acting,
             replay=replay,
-            rounds=jnp.asarray(rounds, jnp.int64),
+            iterations=jnp.asarray(iterations, jnp.int64),
             pairs=state.pairs + int(np.sum(recording.live)),
             sensor=(),
         )
-        return state, session_report(state, expert, losses, returns, began)
+        return state, session_info(state, expert, losses, returns, began)
 
     known = {**identity(agent, discriminator), **how._asdict(), **dict(configuration or {})}
     return Learner("noisy-AIRL", task, known, init, update)  # type: ignore[arg-type]

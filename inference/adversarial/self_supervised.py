@@ -26,7 +26,7 @@ from ...models.networks.modules import DTYPE, ShapedReward
 from ...models.observation.recordings import Recording
 from ..sessions.learner import Learner
 from .discriminator import Discriminator
-from .learner import AdversarialReport, AdversarialState, action_log_likelihood
+from .learner import AdversarialInfo, AdversarialState, action_log_likelihood
 from .noise_injection import NoisyRollout, NoisyTraining, noisy_airl, roll_out_noisily
 from .policy_optimisation import PPO, PPOState
 from .rollouts import begin, finished_returns
@@ -200,7 +200,7 @@ class SSRRTraining(NamedTuple):
         the highest levels leave no difference among the others (for Hopper the released end at 0.75)
     trajectories : int, episodes at each
     regression : Regression
-    rounds : int, of the second policy, in a session
+    iterations : int, of the second policy, in a session
     average : "mean" (as released) or "median", of the scores at a level; one episode in which the first
         reward plunges moves the mean of five a long way
     start : "scratch" (as released, who take a million steps and more) or "first", the second policy as it
@@ -210,13 +210,13 @@ class SSRRTraining(NamedTuple):
     levels: Sequence[float] = tuple(0.05 * i for i in range(20))
     trajectories: int = 5
     regression: Regression = Regression()
-    rounds: int = 10
+    iterations: int = 10
     average: str = "mean"
     start: str = "scratch"
 
     def checked(self) -> SSRRTraining:
         """Itself. Raises ``ValueError`` naming a field that cannot be."""
-        for name in ("trajectories", "rounds"):
+        for name in ("trajectories", "iterations"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         if self.average not in AVERAGES:
@@ -254,7 +254,7 @@ class SSRRState(NamedTuple):
         return np.concatenate([np.ravel(x) for x in jax.tree.leaves(self.network.members)])
 
 
-class SSRRReport(NamedTuple):
+class SSRRInfo(NamedTuple):
     """What a session did.
 
     Fields
@@ -265,7 +265,7 @@ class SSRRReport(NamedTuple):
     curve : NoiseCurve
     loss, held_out : float ``[members]``
         Mean squared errors of the regression: on its last batch, and on snippets it did not see.
-    returns : float ``[rounds]``
+    returns : float ``[iterations]``
         Mean return, by the environment's own reward, of the episodes that the second policy finished; NaN
         where none ended. Learning never sees it.
     first : AdversarialReport, noisy-AIRL's
@@ -283,7 +283,7 @@ class SSRRReport(NamedTuple):
     loss: Float[np.ndarray, " members"]
     held_out: Float[np.ndarray, " members"]
     returns: Float[np.ndarray, " rounds"]
-    first: AdversarialReport
+    first: AdversarialInfo
     pairs: int
     environment_steps: int
     iterations: int
@@ -329,10 +329,10 @@ def ssrr(
             generator=agent.init(k_agent),
         )
 
-    def update(state: SSRRState, recording: Recording) -> tuple[SSRRState, SSRRReport]:
+    def update(state: SSRRState, recording: Recording) -> tuple[SSRRState, SSRRInfo]:
         began = time.perf_counter()
         key, k_rank, k_regress = jax.random.split(state.key, 3)
-        imitated: AdversarialReport
+        imitated: AdversarialInfo
         imitation, imitated = first.update(state.first, recording)  # type: ignore[arg-type, assignment]
         curve, ranked = rank(
             environment, imitation.generator, imitation.network, levels, how.trajectories, k_rank, how.average
@@ -341,7 +341,7 @@ def ssrr(
         acting, returns = state.generator, []
         if how.start == "first" and state.session == 0:
             acting = acting._replace(policy=imitation.generator.policy)
-        for _ in range(how.rounds):
+        for _ in range(how.iterations):
             before = acting.running
             acting, rollout = agent.collect(acting)
             acting = agent.improve(acting, rollout, rewarded(network, rollout))
@@ -349,7 +349,7 @@ def ssrr(
             returns.append(finished.mean() if len(finished) else np.nan)
         state = SSRRState(state.session + 1, key, imitation, network, memory, acting)
         session = int(state.session)
-        report = SSRRReport(
+        info = SSRRInfo(
             session=session,
             log_likelihood=float(action_log_likelihood(acting.policy, reported_steps(recording))),
             curve=curve,
@@ -359,12 +359,12 @@ def ssrr(
             first=imitated,
             pairs=imitated.pairs,
             environment_steps=imitated.environment_steps
-            + session * (ranking_steps + how.rounds * settings.steps),
-            iterations=imitated.iterations + how.rounds,
+            + session * (ranking_steps + how.iterations * settings.steps),
+            iterations=imitated.iterations + how.iterations,
             seconds=time.perf_counter() - began,
             weights=state.weights,
         )
-        return state, report
+        return state, info
 
     known = {**first.configuration, "ssrr": how._replace(regression=how.regression._asdict())._asdict()}  # type: ignore[arg-type]
     return Learner("SSRR", first.mdp, {**known, **dict(configuration or {})}, init, update)  # type: ignore[arg-type]

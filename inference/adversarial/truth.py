@@ -72,12 +72,12 @@ class Sampled(NamedTuple):
     ------
     chain : the truth's, to go on from
     expert : ExpertTransitions
-    samplings : int, made of the truth
+    draws : int, made of the truth
     """
 
     chain: Any
     expert: ExpertTransitions
-    samplings: int
+    draws: int
 
 
 def look(

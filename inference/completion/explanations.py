@@ -16,7 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ...models.observation.demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration
-from ...models.observation.evidence import Imperfection, fitting_sensor
+from ...models.observation.evidence import AnySensor, fitting_sensor
 from ...models.process.mdp import TabularMDP
 from .smoothing import Evidence, evidence_of, smooth_all
 
@@ -37,7 +37,7 @@ class SeenInPart(NamedTuple):
     live: Bool[Array, " n"]
 
 
-Jumble = SeenWhole | SeenInPart
+Trajectories = SeenWhole | SeenInPart
 
 
 class Explained(NamedTuple):
@@ -58,18 +58,18 @@ class Explained(NamedTuple):
     seen: Float[Array, "n S A"]
 
 
-def is_seen_whole(sensor: Imperfection, demonstration: Demonstration) -> bool:
+def is_seen_whole(sensor: AnySensor, demonstration: Demonstration) -> bool:
     """Whether every step was perceived exactly, state and action."""
     kind, state, action, _ = (np.asarray(x) for x in demonstration)
     gaps = (kind == HIDDEN) | (kind == LOST) | ((kind == SEEN) & ((state == UNKNOWN) | (action == UNKNOWN)))
-    return sensor.reading is None and not gaps.any()
+    return sensor.noise is None and not gaps.any()
 
 
-def seen_whole(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> SeenWhole:
+def seen_whole(mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration) -> SeenWhole:
     """Gather the visits of fully seen trajectories; traceable."""
     sensor = fitting_sensor(sensor, mdp)
     kind, state, action, _ = (jnp.asarray(x) for x in demonstration)
-    present = jnp.ones(mdp.n_states) if sensor.presence is None else sensor.presence
+    present = jnp.ones(mdp.n_states) if sensor.visibility is None else sensor.visibility
 
     def one(kind: Int[Array, " L"], state: Int[Array, " L"], action: Int[Array, " L"]) -> tuple:
         alive = kind != PAD
@@ -85,47 +85,47 @@ def seen_whole(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstrati
     return SeenWhole(visits, constant, kind[:, 0] != PAD)
 
 
-def seen_in_part(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> SeenInPart:
+def seen_in_part(mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration) -> SeenInPart:
     """Evaluate a sensor on trajectories with gaps or noise; traceable."""
     evidence = evidence_of(mdp, sensor, demonstration)
     return SeenInPart(evidence, jnp.asarray(demonstration.kind) == SEEN, evidence.live[:, 0])
 
 
-def explain(mdp: TabularMDP, log_policy: Float[Array, "S A"], jumble: Jumble) -> Explained:
+def explain(mdp: TabularMDP, log_policy: Float[Array, "S A"], trajectories: Trajectories) -> Explained:
     """Explain every trajectory by one policy."""
-    if isinstance(jumble, SeenWhole):
-        visits, constant, live = jumble
+    if isinstance(trajectories, SeenWhole):
+        visits, constant, live = trajectories
         gained = jnp.einsum("nsa,sa->n", visits, jnp.where(mdp.available, log_policy, 0.0))
         return Explained(jnp.where(live, constant + gained, 0.0), visits, visits)
-    log_likelihood, pairs, _ = smooth_all(mdp, log_policy, jumble.evidence)
-    seen = jnp.einsum("nlsa,nl->nsa", pairs, jumble.seen.astype(float))
+    log_likelihood, pairs, _ = smooth_all(mdp, log_policy, trajectories.evidence)
+    seen = jnp.einsum("nlsa,nl->nsa", pairs, trajectories.seen.astype(float))
     return Explained(log_likelihood, jnp.sum(pairs, axis=1), seen)
 
 
 def explain_each(
     mdp: TabularMDP,
     log_policies: Float[Array, "D S A"],
-    jumble: Jumble,
+    trajectories: Trajectories,
     present: Bool[Array, " D"] | None = None,
 ) -> Explained:
     """Explain every trajectory by every policy: fields as in :class:`Explained`, with a leading ``D``.
 
     Those of policies that are not ``present`` may be anything finite.
     """
-    if isinstance(jumble, SeenWhole):
-        return jax.vmap(lambda x: explain(mdp, x, jumble))(log_policies)
+    if isinstance(trajectories, SeenWhole):
+        return jax.vmap(lambda x: explain(mdp, x, trajectories))(log_policies)
     # One policy at a time: a pass holds [n, L, S, A] posteriors, which ways should not multiply.
     if present is None:
-        return lax.map(lambda x: explain(mdp, x, jumble), log_policies)
-    n = len(jumble.live)
+        return lax.map(lambda x: explain(mdp, x, trajectories), log_policies)
+    n = len(trajectories.live)
     nothing = Explained(jnp.zeros(n), *(jnp.zeros((n, mdp.n_states, mdp.n_actions)),) * 2)
     return lax.map(
-        lambda x: lax.cond(x[1], lambda: explain(mdp, x[0], jumble), lambda: nothing),
+        lambda x: lax.cond(x[1], lambda: explain(mdp, x[0], trajectories), lambda: nothing),
         (log_policies, present),
     )
 
 
-def without_reward(mdp: TabularMDP, jumble: Jumble) -> Explained:
+def without_reward(mdp: TabularMDP, trajectories: Trajectories) -> Explained:
     """Explain every trajectory by somebody who does anything: what is known before any reward is."""
     uniform = jnp.where(mdp.available, -jnp.log(jnp.sum(mdp.available, axis=1))[:, None], -jnp.inf)
-    return explain(mdp, uniform, jumble)
+    return explain(mdp, uniform, trajectories)

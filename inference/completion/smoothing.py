@@ -18,7 +18,7 @@ from ...models.inputs.arguments import as_key
 from ...models.laws import chain
 from ...models.laws.chain import Filtered, Smoothed, filter_all, filter_forward, sample_backward
 from ...models.observation.demonstration import PAD, Demonstration
-from ...models.observation.evidence import Imperfection, log_evidence
+from ...models.observation.evidence import AnySensor, log_evidence
 from ...models.process.mdp import TabularMDP
 
 
@@ -56,7 +56,7 @@ class Expectations(NamedTuple):
     size: Float[Array, ""]
 
 
-def evidence_of(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> Evidence:
+def evidence_of(mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration) -> Evidence:
     """Evaluate a sensor on a demonstration once, for all passes over it.
 
     Raises as :func:`~i2rl.models.observation.evidence.log_evidence` does.

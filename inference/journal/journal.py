@@ -332,7 +332,7 @@ class JournalView:
         """The input consumed by the last committed session."""
         return self.position_after(self.session) or Position()
 
-    def reports(self, last: int | None = None) -> Iterator[SessionRecord]:
+    def records(self, last: int | None = None) -> Iterator[SessionRecord]:
         """Committed sessions, in order: all of them, or the ``last`` few, of which no others are read.
 
         Raises :class:`JournalError` naming one that is damaged, or between which two something is missing.
@@ -379,7 +379,7 @@ class JournalView:
         found = self._select("PRAGMA quick_check(1)")[0][0]
         if found != "ok":
             raise self._damaged(shortened(found, 200))
-        sessions = sum(1 for _ in self.reports())
+        sessions = sum(1 for _ in self.records())
         self.stored_state()
         return sessions
 
@@ -393,7 +393,7 @@ class JournalView:
         """
         import arviz
 
-        return arviz.InferenceData(sessions=_dataset(list(self.reports()), self.origin))
+        return arviz.InferenceData(sessions=_dataset(list(self.records()), self.origin))
 
     def to_netcdf(self, filename: str | os.PathLike[str]) -> None:
         """Write :meth:`to_inference_data` as NetCDF, to be read by ``arviz.from_netcdf``.

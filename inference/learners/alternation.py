@@ -12,7 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...models.laws.chain import Smoothed
 from ...models.observation.evidence import (
-    Imperfection,
+    AnySensor,
 )
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import SoftPlan, reward_of, soft_plan
@@ -33,7 +33,7 @@ class Method(NamedTuple):
     """Choices that the parts of a session share."""
 
     mdp: TabularMDP
-    sensor: Imperfection
+    sensor: AnySensor
     statistic: Statistic
     completion: Callable[[Array, TabularMDP, Float[Array, "S A"], Evidence], Smoothed]
     slack: Schedule
@@ -73,7 +73,7 @@ class Method(NamedTuple):
 
 def checked_method(
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     statistic: str,
     completion: str,
     slack: Schedule,

@@ -1,4 +1,4 @@
-"""The Boltzmann-rational expert: ``pi(a | s) ~ exp(eta Q*(s, a))``.
+"""The Boltzmann-rational expert: ``pi(a | s) ~ exp(rationality Q*(s, a))``.
 
 The likelihood of Bayesian and maximum-likelihood IRL (Ramachandran and Amir 2007; Babes-Vroman et al. 2011;
 Choi and Kim 2012). Unlike the soft policy of maximum causal entropy, the expert plans as if it would act
@@ -38,21 +38,21 @@ def optimal_action_values(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float
 
 
 def boltzmann_log_policy(
-    mdp: TabularMDP, weights: Float[Array, " K"], eta: float | Array = ETA
+    mdp: TabularMDP, weights: Float[Array, " K"], rationality: float | Array = ETA
 ) -> Float[Array, "S A"]:
-    """``log pi(a | s)``, the log-softmax of ``eta Q*`` over available actions; ``-inf`` where unavailable.
+    """Return ``log pi(a | s)``, the log-softmax of ``rationality Q*`` over available actions, else ``-inf``.
 
-    ``eta`` is the inverse temperature, per unit of value. Differentiable as
+    ``rationality`` is the inverse temperature, per unit of value. Differentiable as
     :func:`optimal_action_values`. Raises ``ValueError`` for discount 1.
     """
-    return jax.nn.log_softmax(eta * optimal_action_values(mdp, weights), axis=1)
+    return jax.nn.log_softmax(rationality * optimal_action_values(mdp, weights), axis=1)
 
 
 def boltzmann_log_likelihoods(
     mdp: TabularMDP,
     weights: Float[Array, " K"],
     counts: Float[Array, "n S A"],
-    eta: float | Array = ETA,
+    rationality: float | Array = ETA,
 ) -> Float[Array, " n"]:
     """``sum_{s, a} N_i(s, a) log pi(a | s)`` of each trajectory's visits ``N_i``, in nats.
 
@@ -61,7 +61,7 @@ def boltzmann_log_likelihoods(
     trajectory's log-likelihood is ``-inf``).
     """
     require_available_visits(mdp, counts)
-    return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, eta), counts)
+    return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, rationality), counts)
 
 
 def count_log_likelihoods(

@@ -39,7 +39,7 @@ from ...models.observation.evidence import Sensor, checked_demonstration, requir
 from ...models.process.mdp import Labels, TabularMDP
 from ...models.process.planning import features_to_go, require_discounted, reward_of, soft_plan
 from ..completion.smoothing import Evidence, evidence_of, smooth_all
-from ..sessions.learner import Learner, Report
+from ..sessions.learner import Learner, SessionInfo
 from ..sessions.scaling import on_scaled_features
 from ..sessions.statistic import FEATURES, FeatureStatistic, complete
 
@@ -178,24 +178,24 @@ def _learner(learning_rate: float, decay: float, radius: float, steps: int, mdp:
         weights = jax.random.uniform(as_key(key), (mdp.n_features,), float)
         return DarkoState(weights, (), jnp.zeros(mdp.n_states), jnp.zeros((), int))
 
-    def session(state: DarkoState, demonstration: Demonstration) -> tuple[DarkoState, Report]:
+    def session(state: DarkoState, demonstration: Demonstration) -> tuple[DarkoState, SessionInfo]:
         return _session(mdp, settings, state, demonstration)
 
-    def update(state: DarkoState, demonstration: Demonstration) -> tuple[DarkoState, Report]:
+    def update(state: DarkoState, demonstration: Demonstration) -> tuple[DarkoState, SessionInfo]:
         began = time.perf_counter()
         demonstration = checked_demonstration(mdp, demonstration, needed_by="a session")
-        new, report = session(state, demonstration.bucketed())
-        if not np.isfinite(report.demonstration_log_likelihood):
+        new, info = session(state, demonstration.bucketed())
+        if not np.isfinite(info.demonstration_log_likelihood):
             require_possible(Sensor(), mdp, demonstration)
             raise DemonstrationError("a trajectory has probability zero under the current policy")
-        return new, report.in_plain_numbers(time.perf_counter() - began)
+        return new, info.in_plain_numbers(time.perf_counter() - began)
 
     configuration = {"learning_rate": learning_rate, "decay": decay, "radius": radius, "steps": steps}
     return Learner("DARKO", mdp, configuration, init, update, session)
 
 
 class _Settings(NamedTuple):
-    rate: Float[Array, ""]
+    learning_rate: Float[Array, ""]
     decay: Float[Array, ""]
     radius: Float[Array, ""]
     steps: Int[Array, ""]
@@ -204,14 +204,14 @@ class _Settings(NamedTuple):
 @jax.jit
 def _session(
     mdp: TabularMDP, settings: _Settings, state: DarkoState, demonstration: Demonstration
-) -> tuple[DarkoState, Report]:
+) -> tuple[DarkoState, SessionInfo]:
     observed = _seen(mdp, demonstration)
     number = state.session + 1
-    rate = settings.rate * number.astype(float) ** -settings.decay
+    learning_rate = settings.learning_rate * number.astype(float) ** -settings.decay
 
     def descend(i: Int[Array, ""], carry: tuple) -> tuple:
         weights, found, first = carry
-        moved = weights - rate * found.margin
+        moved = weights - learning_rate * found.margin
         length = jnp.linalg.norm(moved)
         inside = moved * jnp.where(length > settings.radius, settings.radius / length, 1.0)
         # The zeroth step only looks: one margin to compile serves the start, the steps and the end.
@@ -224,7 +224,7 @@ def _session(
     unseen = Margin(jnp.zeros(k), nothing, state.values, jnp.array(jnp.nan))
     begin = (state.weights, unseen, jnp.array(jnp.nan))
     weights, after, first = lax.fori_loop(0, settings.steps + 1, descend, begin)
-    report: dict[str, Any] = {
+    info: dict[str, Any] = {
         "session": number,
         "log_likelihood": FEATURES.log_likelihood(mdp, weights, after.values, after.statistic),
         "demonstration_log_likelihood": after.log_likelihood,
@@ -237,7 +237,7 @@ def _session(
     }
     possible = jnp.isfinite(after.log_likelihood)
     learned = DarkoState(weights, (), after.values, number)
-    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), learned, state), Report(**report)
+    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), learned, state), SessionInfo(**info)
 
 
 # -- goals --------------------------------------------------------------------------------------------

@@ -65,7 +65,7 @@ class Settings(NamedTuple):
     """Numbers of the model and its sampler; see :func:`dpm_birl`."""
 
     alpha: Float[Array, ""]
-    eta: Float[Array, ""]
+    rationality: Float[Array, ""]
     sigma: Float[Array, ""]
 
 
@@ -74,19 +74,19 @@ class DPMTrace(NamedTuple):
 
     Fields
     ------
-    labels : int ``[sweeps, n]``
+    labels : int ``[iterations, n]``
         Cluster of each trajectory, numbered by first appearance, -1 for rows of padding.
-    n_clusters : int ``[sweeps]``
-    weights : float ``[sweeps, n, K]``
+    n_components : int ``[iterations]``
+    weights : float ``[iterations, n, K]``
         Weights of each trajectory's cluster, NaN for rows of padding.
-    log_joint : float ``[sweeps]``
+    log_joint : float ``[iterations]``
         Log-density of seating, weights and demonstration together, in nats.
-    assignment_acceptance, weight_acceptance : float ``[sweeps]``
+    assignment_acceptance, weight_acceptance : float ``[iterations]``
         Share of proposals accepted (an assignment to the same cluster counts as accepted).
     """
 
     labels: Int[np.ndarray, "sweeps n"]
-    n_clusters: Int[np.ndarray, " sweeps"]
+    n_components: Int[np.ndarray, " sweeps"]
     weights: Float[np.ndarray, "sweeps n K"]
     log_joint: Float[np.ndarray, " sweeps"]
     assignment_acceptance: Float[np.ndarray, " sweeps"]
@@ -96,8 +96,8 @@ class DPMTrace(NamedTuple):
 class DPMBIRL(NamedTuple):
     """DPM-BIRL on one decision process.
 
-    ``sample(key, demonstration)`` returns all sweeps; ``fit(key, demonstration)`` the one of highest joint
-    density, each trajectory wholly in its cluster.
+    ``sample(key, demonstration)`` returns all iterations; ``fit(key, demonstration)`` the one of highest
+    joint density, each trajectory wholly in its cluster.
     """
 
     name: str
@@ -117,8 +117,8 @@ def crp_log_probability(sizes: Int[Array, " D"], alpha: Float[Array, ""]) -> Flo
     return jnp.sum(tables) + jax.scipy.special.gammaln(alpha) - jax.scipy.special.gammaln(alpha + total)
 
 
-def _log_policy(mdp: TabularMDP, weights: Float[Array, " K"], eta: Array) -> Float[Array, "S A"]:
-    return jnp.where(mdp.available, boltzmann_log_policy(mdp, weights, eta), 0.0)
+def _log_policy(mdp: TabularMDP, weights: Float[Array, " K"], rationality: Array) -> Float[Array, "S A"]:
+    return jnp.where(mdp.available, boltzmann_log_policy(mdp, weights, rationality), 0.0)
 
 
 def _log_joint(seating: Seating, counts: Float[Array, "n S A"], alpha: Array) -> Float[Array, ""]:
@@ -134,7 +134,7 @@ def _first_seating(key: Array, mdp: TabularMDP, counts: Float[Array, "n S A"], s
     label_key, weight_key = jax.random.split(key)
     labels = jax.random.randint(label_key, (n,), 0, n)
     weights = jax.vmap(random_weights, in_axes=(0, None))(jax.random.split(weight_key, n), mdp.n_features)
-    policies = lax.map(lambda w: _log_policy(mdp, w, settings.eta), weights)
+    policies = lax.map(lambda w: _log_policy(mdp, w, settings.rationality), weights)
     return Seating(labels, jnp.zeros(n, int).at[labels].add(1), weights, policies)
 
 
@@ -160,7 +160,7 @@ def _reseat(
 
     def new_cluster() -> tuple:
         weights = random_weights(prior_key, mdp.n_features)
-        return weights, _log_policy(mdp, weights, settings.eta)
+        return weights, _log_policy(mdp, weights, settings.rationality)
 
     weights, policy = lax.cond(
         there == free, new_cluster, lambda: (seating.weights[there], seating.log_policies[there])
@@ -199,7 +199,7 @@ def _langevin(
 
     @partial(jax.value_and_grad, has_aux=True)
     def objective(w: Float[Array, " K"]) -> tuple:
-        log_policy = _log_policy(mdp, w, settings.eta)
+        log_policy = _log_policy(mdp, w, settings.rationality)
         return jnp.sum(visits * log_policy), log_policy
 
     def drifted(w: Float[Array, " K"], gradient: Float[Array, " K"]) -> Float[Array, " K"]:
@@ -253,13 +253,13 @@ def _move_weights(
 # -- the sampler --------------------------------------------------------------------------------------
 
 
-@partial(jax.jit, static_argnames=("sweeps", "proposals", "updates"))
+@partial(jax.jit, static_argnames=("iterations", "proposals", "updates"))
 def _sample(
     key: Array,
     mdp: TabularMDP,
     counts: Float[Array, "n S A"],
     settings: Settings,
-    sweeps: int,
+    iterations: int,
     proposals: int,
     updates: int,
 ) -> tuple:
@@ -272,22 +272,22 @@ def _sample(
         seating, seated = lax.scan(partial(_reseat, mdp, settings, counts), seating, (turns, keys))
         move = partial(_move_weights, mdp, settings, counts, updates)
         seating, moved = lax.scan(move, seating, (jnp.arange(n), jax.random.split(move_key, n)))
-        clusters = jnp.sum(seating.sizes > 0)
-        weight_acceptance = jnp.sum(moved) / (clusters * updates)
+        n_components = jnp.sum(seating.sizes > 0)
+        weight_acceptance = jnp.sum(moved) / (n_components * updates)
         log_joint = _log_joint(seating, counts, settings.alpha)
         return seating, (seating.labels, seating.weights, log_joint, jnp.mean(seated), weight_acceptance)
 
     start_key, sweep_key = jax.random.split(key)
     first = _first_seating(start_key, mdp, counts, settings)
-    return lax.scan(sweep, first, jax.random.split(sweep_key, sweeps))[1]
+    return lax.scan(sweep, first, jax.random.split(sweep_key, iterations))[1]
 
 
 def dpm_birl(
     mdp: TabularMDP,
     *,
-    eta: float = ETA,
+    rationality: float = ETA,
     alpha: float = 1.0,
-    sweeps: int = 100,
+    iterations: int = 100,
     proposals: int = 2,
     updates: int = 10,
     sigma: float = 0.01,
@@ -311,11 +311,11 @@ def dpm_birl(
     Parameters
     ----------
     mdp : TabularMDP
-    eta : float
+    rationality : float
         Inverse temperature of the experts, per unit of value.
     alpha : float
         Concentration: large values expect many clusters.
-    sweeps, proposals, updates : int
+    iterations, proposals, updates : int
         Outer iterations; assignment proposals per trajectory and weight moves per cluster in each.
     sigma : float
         Width of the scaled weights' moves, at most 0.5.
@@ -332,11 +332,18 @@ def dpm_birl(
         For numbers that are not positive, a ``sigma`` above 0.5, or an undiscounted MDP.
     """
     require_discounted(mdp)
-    require_positive(eta=eta, alpha=alpha, sweeps=sweeps, proposals=proposals, updates=updates, sigma=sigma)
+    require_positive(
+        rationality=rationality,
+        alpha=alpha,
+        iterations=iterations,
+        proposals=proposals,
+        updates=updates,
+        sigma=sigma,
+    )
     if sigma > _WIDEST:
         raise ValueError(f"sigma must be at most {_WIDEST}, a quarter of the box [-1, 1], got {sigma}")
     scale, scaled = np.asarray(feature_scale(mdp)), with_scaled_features(mdp)
-    settings = Settings(*(jnp.asarray(float(x)) for x in (alpha, eta, sigma)))
+    settings = Settings(*(jnp.asarray(float(x)) for x in (alpha, rationality, sigma)))
 
     def sample(key: Array, demonstration: Demonstration) -> DPMTrace:
         counts = visit_counts(mdp, demonstration)
@@ -344,12 +351,12 @@ def dpm_birl(
         places, table, *rest = (
             np.asarray(x)
             for x in _sample(
-                as_key(key), scaled, jnp.asarray(counts[real]), settings, sweeps, proposals, updates
+                as_key(key), scaled, jnp.asarray(counts[real]), settings, iterations, proposals, updates
             )
         )
-        labels = np.full((sweeps, len(real)), -1)
+        labels = np.full((iterations, len(real)), -1)
         labels[:, real] = [_by_appearance(row) for row in places]
-        weights = np.full((sweeps, len(real), mdp.n_features), np.nan)
+        weights = np.full((iterations, len(real), mdp.n_features), np.nan)
         weights[:, real] = np.take_along_axis(table, places[..., None], axis=1) / scale
         return DPMTrace(labels, labels.max(1) + 1, weights, *rest)
 
@@ -362,11 +369,11 @@ def dpm_birl(
 def best_sample(trace: DPMTrace) -> Clustering:
     """The sweep of highest joint density as a clustering; rows of padding get the proportions."""
     best = int(np.argmax(trace.log_joint))
-    labels, n_clusters = trace.labels[best], int(trace.n_clusters[best])
-    responsibilities = (labels[:, None] == np.arange(n_clusters)).astype(float)
+    labels, n_components = trace.labels[best], int(trace.n_components[best])
+    responsibilities = (labels[:, None] == np.arange(n_components)).astype(float)
     proportions = responsibilities.sum(0) / responsibilities.sum()
     responsibilities[labels < 0] = proportions
-    first = [int(np.flatnonzero(labels == d)[0]) for d in range(n_clusters)]
+    first = [int(np.flatnonzero(labels == d)[0]) for d in range(n_components)]
     return Clustering(trace.weights[best, first], proportions, responsibilities, float(trace.log_joint[best]))
 
 

@@ -22,8 +22,8 @@ from jaxtyping import Array, Bool, Float
 
 from ...models.observation.demonstration import SEEN, Demonstration, DemonstrationError
 from ...models.observation.evidence import (
+    AnySensor,
     FeatureNoise,
-    Imperfection,
     Sensor,
     checked_demonstration,
     fitting_sensor,
@@ -115,7 +115,7 @@ def sensor_identifier(
     mdp: TabularMDP,
     predicates: ArrayLike,
     *,
-    view: Imperfection | None = None,
+    view: AnySensor | None = None,
     reportable: ArrayLike | None = None,
     scores: str = "stepwise",
     errors: float = 0.25,
@@ -135,14 +135,14 @@ def sensor_identifier(
         raise ValueError(
             f"predicates have shape [J, S, A] = [J, {mdp.n_states}, {mdp.n_actions}], got {list(psi.shape)}"
         )
-    seen: Imperfection = Sensor() if view is None else Sensor() * view
-    if seen.reading is not None:
+    seen: AnySensor = Sensor() if view is None else Sensor() * view
+    if seen.noise is not None:
         raise ValueError("the view says what is hidden; how reports err is fitted, not given")
     seen = fitting_sensor(seen, mdp)
     mask = None if reportable is None else np.asarray(reportable, bool)
     classes = report_classes(psi, mask)
     perception = entropic_perception(classes, scores, "posterior", errors, 1.0)
-    fit = _fit(mdp, perception, seen.presence, initial_logits(psi, DEFAULT_START))
+    fit = _fit(mdp, perception, seen.visibility, initial_logits(psi, DEFAULT_START))
     slips = mdp.available / mdp.available.sum(1, keepdims=True)
 
     def identify(demonstration: Demonstration, weights: ArrayLike) -> SensorIdentification:
@@ -174,7 +174,7 @@ def sensor_identifier(
 def _fit(
     mdp: TabularMDP,
     perception: Perception,
-    presence: Float[Array, " S"] | None,
+    visibility: Float[Array, " S"] | None,
     first_logits: Float[Array, " J"],
 ) -> Callable[[PreparedSession, Float[Array, "S A"]], tuple[Float[Array, " J"], Float[Array, " n"]]]:
     """Agreement after the alternation of truths and sensor, the expert's behaviour being given.
@@ -190,7 +190,9 @@ def _fit(
 
         def step(_: int, carry: tuple) -> tuple:
             logits = carry[0]
-            evidence = report_log_evidence(perception.classes, logits, session.reports, confidence, presence)
+            evidence = report_log_evidence(
+                perception.classes, logits, session.reports, confidence, visibility
+            )
             truths = smooth_all(mdp, log_policy, Evidence(evidence, session.live))
             heard = perception.summarise(logits, session, confidence, truths.pairs)
             logits = perception.fit(heard, logits)

@@ -37,7 +37,7 @@ from ...models.process.planning import (
     require_discounted,
     reward_of,
 )
-from ..sessions.learner import Learner, Report
+from ..sessions.learner import Learner, SessionInfo
 from ..sessions.scaling import on_scaled_features
 
 
@@ -142,30 +142,30 @@ def _learner(name: str, mdp: TabularMDP, learning_rate: float) -> Learner:
     require_discounted(mdp)
     if not 0 < learning_rate < math.inf:
         raise ValueError(f"the learning rate must be a positive number, got {learning_rate}")
-    rate = jnp.asarray(learning_rate, float)
+    step_size = jnp.asarray(learning_rate, float)
 
     def init(key: Array) -> JinState:
         as_key(key)  # unused: the first reward is fixed
         size = mdp.n_features
         return JinState(jnp.full(size, 1 / math.sqrt(size)), (), jnp.zeros((), int))
 
-    def session(state: JinState, demonstration: Demonstration) -> tuple[JinState, Report]:
-        return _session(mdp, rate, state, demonstration)
+    def session(state: JinState, demonstration: Demonstration) -> tuple[JinState, SessionInfo]:
+        return _session(mdp, step_size, state, demonstration)
 
-    def update(state: JinState, demonstration: Demonstration) -> tuple[JinState, Report]:
+    def update(state: JinState, demonstration: Demonstration) -> tuple[JinState, SessionInfo]:
         began = time.perf_counter()
         demonstration = checked_demonstration(mdp, demonstration)
         _require_available(mdp, demonstration)
-        new, report = session(state, demonstration.bucketed())
-        return new, report.in_plain_numbers(time.perf_counter() - began)
+        new, info = session(state, demonstration.bucketed())
+        return new, info.in_plain_numbers(time.perf_counter() - began)
 
     return Learner(name, mdp, {"learning_rate": learning_rate}, init, update, session)
 
 
 @jax.jit
 def _session(
-    mdp: TabularMDP, rate: Float[Array, ""], state: JinState, demonstration: Demonstration
-) -> tuple[JinState, Report]:
+    mdp: TabularMDP, step_size: Float[Array, ""], state: JinState, demonstration: Demonstration
+) -> tuple[JinState, SessionInfo]:
     kind, states, actions = (jnp.asarray(x).reshape(-1) for x in demonstration[:3])
     full = (kind == SEEN) & (states != UNKNOWN) & (actions != UNKNOWN)
     in_range = (states >= 0) & (states < mdp.n_states) & (actions >= 0) & (actions < mdp.n_actions)
@@ -176,7 +176,7 @@ def _session(
         def learn() -> tuple:
             weights, mistakes = carry
             found = reward_correction(mdp, weights, s, a)
-            step = jnp.where(found.mistaken, rate, 0.0) * found.direction
+            step = jnp.where(found.mistaken, step_size, 0.0) * found.direction
             return weights + step, mistakes + found.mistaken
 
         return lax.cond(usable, learn, lambda: carry), None
@@ -185,18 +185,18 @@ def _session(
     (weights, mistakes), _ = lax.scan(look, begin, (states, actions, full))
     possible = jnp.all(~full | (in_range & mdp.available[states, actions]))
     learned = JinState(weights, (), state.session + 1)
-    report: dict[str, Any] = {
+    info: dict[str, Any] = {
         "session": state.session + 1,
         "log_likelihood": jnp.where(possible, jnp.nan, -jnp.inf),
         "demonstration_log_likelihood": jnp.where(possible, jnp.nan, -jnp.inf),
-        "gradient": jnp.linalg.norm(weights - state.weights) / rate,
+        "gradient": jnp.linalg.norm(weights - state.weights) / step_size,
         "iterations": jnp.sum(full),
         "solver_iterations": mistakes,
         "converged": jnp.array(True),
         "seconds": jnp.array(jnp.nan),
         "weights": weights,
     }
-    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), learned, state), Report(**report)
+    return jax.tree.map(lambda a, b: jnp.where(possible, a, b), learned, state), SessionInfo(**info)
 
 
 def _require_available(mdp: TabularMDP, demonstration: Demonstration) -> None:

@@ -22,7 +22,7 @@ from ...models.inputs.arguments import as_key
 from ...models.observation.demonstration import SEEN as SEEN_STEP
 from ...models.observation.demonstration import Demonstration, DemonstrationError
 from ...models.observation.evidence import (
-    Imperfection,
+    AnySensor,
     Sensor,
     checked_demonstration,
     fitting_sensor,
@@ -36,7 +36,7 @@ from ..programs.maximum_entropy import (
     Solution,
     WarmStart,
 )
-from ..sessions.learner import Learner, Report, digest_of
+from ..sessions.learner import Learner, SessionInfo, digest_of
 from ..sessions.scaling import on_scaled_features
 from ..sessions.schedule import Schedule, described, require_slack_in
 from ..sessions.statistic import blend
@@ -96,7 +96,7 @@ class _Iterate(NamedTuple):
 
 def lme_i2rl(
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     *,
     statistic: str = "seen",
     completion: str = "exact",
@@ -166,7 +166,7 @@ def lme_i2rl(
     return on_scaled_features(mdp, build)
 
 
-def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Learner:
+def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Learner:
     """LME-I2RL that forgets its weights: every session starts from fresh random ones (section 7.3).
 
     A control for what passing the weights on is worth. Options as for :func:`lme_i2rl`.
@@ -257,7 +257,7 @@ def _close(
     program: Any,
     evidence: Evidence,
     seen: Bool[Array, "n L"],
-) -> tuple[LMEState, Report]:
+) -> tuple[LMEState, SessionInfo]:
     """End a session: complete its demonstration once more, under its own result, and keep the statistic."""
     mdp, statistic = method.mdp, method.statistic
     key, sample = jax.random.split(point.key)
@@ -281,7 +281,7 @@ def _close(
     # An observation that cannot be must not spoil what was learned (a fleet raises nothing).
     possible = jnp.isfinite(own)
     state = jax.tree.map(partial(jnp.where, possible), learned, state._replace(program=program))
-    return state, Report(**fields)
+    return state, SessionInfo(**fields)
 
 
 def _learner(
@@ -311,10 +311,10 @@ def _learner(
         key, fresh = jax.random.split(state.key)
         return evidence, seen, key, *start(fresh, state)
 
-    run: Callable[[LMEState, Demonstration], tuple[LMEState, Report]]
+    run: Callable[[LMEState, Demonstration], tuple[LMEState, SessionInfo]]
     if solver in in_jax:
 
-        def session(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
+        def session(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, SessionInfo]:
             evidence, seen, key, weights, values = begin(state, demonstration)
             point = _em(
                 method,
@@ -350,7 +350,7 @@ def _learner(
             gradient = method.gradient(weights, plan.values, working)
             return key, plan.values, own, gradient, working, *method.penalties(working, state.session + 1)
 
-        def run(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
+        def run(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, SessionInfo]:
             evidence, seen, key, weights, values = opening(state, demonstration)
             program, total, steps, change, converged = state.program, 0, 0, np.inf, False
             first = jnp.array(jnp.nan)
@@ -388,15 +388,15 @@ def _learner(
             key,
         )
 
-    def update(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
+    def update(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, SessionInfo]:
         began = time.perf_counter()
         demonstration = checked_demonstration(mdp, demonstration, needed_by="a session")
         require_slack_in(method.slack, int(state.session) + 1)
-        new, report = run(state, demonstration.bucketed())
-        if not np.isfinite(report.demonstration_log_likelihood):
+        new, info = run(state, demonstration.bucketed())
+        if not np.isfinite(info.demonstration_log_likelihood):
             require_possible(method.sensor, mdp, demonstration)
             raise DemonstrationError("a trajectory has probability zero under the current policy")
-        return new, report.in_plain_numbers(time.perf_counter() - began)
+        return new, info.in_plain_numbers(time.perf_counter() - began)
 
     @jax.jit
     def likelihood(state: LMEState, weights: Float[Array, " K"]) -> Float[Array, ""]:
@@ -447,7 +447,7 @@ class Batch(NamedTuple):
 
 def batch_lme(
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     *,
     restarts: int = 3,
     slack: float = DEFAULT_SLACK,

@@ -69,7 +69,7 @@ def ascend(
     mdp: TabularMDP,
     counts: Float[Array, "S A"],
     start: Float[Array, " K"],
-    eta: float | Array,
+    rationality: float | Array,
     iterations: int,
     tolerance: float = 1e-7,
 ) -> Ascent:
@@ -81,7 +81,7 @@ def ascend(
 
     @jax.value_and_grad
     def objective(weights: Float[Array, " K"]) -> Float[Array, ""]:
-        return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, eta), counts[None])[0]
+        return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, rationality), counts[None])[0]
 
     def reach(point: Ascent) -> Float[Array, ""]:
         return point.step * jnp.max(jnp.abs(point.gradient))
@@ -107,9 +107,11 @@ def ascend(
 
 
 @partial(jax.jit, static_argnames=("restarts", "iterations"))
-def _climb(key: Array, mdp: TabularMDP, counts: Array, eta: Array, restarts: int, iterations: int) -> Ascent:
+def _climb(
+    key: Array, mdp: TabularMDP, counts: Array, rationality: Array, restarts: int, iterations: int
+) -> Ascent:
     def from_start(key: Array) -> Ascent:
-        return ascend(mdp, counts, random_weights(key, mdp.n_features), eta, iterations)
+        return ascend(mdp, counts, random_weights(key, mdp.n_features), rationality, iterations)
 
     return lax.map(from_start, jax.random.split(key, restarts))
 
@@ -119,7 +121,7 @@ def mlirl(
     mdp: TabularMDP,
     demonstration: Demonstration,
     *,
-    eta: float = ETA,
+    rationality: float = ETA,
     restarts: int = 5,
     iterations: int = 300,
 ) -> MLIRLFit:
@@ -133,7 +135,7 @@ def mlirl(
         Of the starts, uniform on the box.
     mdp, demonstration
         The decision process; its demonstration, every step seen.
-    eta : float
+    rationality : float
         Inverse temperature of the expert, per unit of value.
     restarts, iterations : int
         Starts, and evaluations from each at most. The likelihood has several local maxima, and ridges
@@ -144,13 +146,15 @@ def mlirl(
     DemonstrationError
         Naming trajectory and step, for a step that was not seen or that is impossible.
     ValueError
-        For an ``eta``, ``restarts`` or ``iterations`` that is not positive, or an undiscounted MDP.
+        For an ``rationality``, ``restarts`` or ``iterations`` that is not positive, or an undiscounted MDP.
     """
     require_discounted(mdp)
-    require_positive(eta=eta, restarts=restarts, iterations=iterations)
+    require_positive(rationality=rationality, restarts=restarts, iterations=iterations)
     counts = visit_counts(mdp, demonstration).sum(0)
     scaled = with_scaled_features(mdp)
-    ends = _climb(as_key(key), scaled, jnp.asarray(counts), jnp.asarray(float(eta)), restarts, iterations)
+    ends = _climb(
+        as_key(key), scaled, jnp.asarray(counts), jnp.asarray(float(rationality)), restarts, iterations
+    )
     best = int(np.argmax(ends.value))
     return MLIRLFit(
         np.asarray(ends.weights[best] / feature_scale(mdp)),
@@ -160,11 +164,11 @@ def mlirl(
     )
 
 
-def require_clusters(clusters: int, trajectories: int) -> None:
+def require_components(n_components: int, trajectories: int) -> None:
     """Raise ``ValueError`` if there are fewer trajectories than clusters to put them in."""
-    if clusters > trajectories:
+    if n_components > trajectories:
         raise ValueError(
-            f"{clusters} clusters were asked for, but the demonstration has {trajectories} "
+            f"{n_components} clusters were asked for, but the demonstration has {trajectories} "
             f"{'trajectory' if trajectories == 1 else 'trajectories'}: every cluster needs at least one"
         )
 
@@ -206,47 +210,51 @@ class EMMLIRL(NamedTuple):
 
 
 def component_log_likelihoods(
-    mdp: TabularMDP, weights: Float[Array, "D K"], counts: Float[Array, "n S A"], eta: float | Array
+    mdp: TabularMDP, weights: Float[Array, "D K"], counts: Float[Array, "n S A"], rationality: float | Array
 ) -> Float[Array, "n D"]:
     """Log-likelihood of every trajectory under every cluster's weights; traceable."""
 
     def one(theta: Float[Array, " K"]) -> Float[Array, " n"]:
-        return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, theta, eta), counts)
+        return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, theta, rationality), counts)
 
     return lax.map(one, weights).T
 
 
-def _e_step(mdp: TabularMDP, mixture: Mixture, counts: Float[Array, "n S A"], eta: Array) -> tuple:
+def _e_step(mdp: TabularMDP, mixture: Mixture, counts: Float[Array, "n S A"], rationality: Array) -> tuple:
     """Responsibilities ``[n, D]`` and the marginal log-likelihood."""
-    joint = jnp.log(mixture.proportions) + component_log_likelihoods(mdp, mixture.weights, counts, eta)
+    joint = jnp.log(mixture.proportions) + component_log_likelihoods(
+        mdp, mixture.weights, counts, rationality
+    )
     marginal = jax.nn.logsumexp(joint, axis=1)
     return jnp.exp(joint - marginal[:, None]), jnp.sum(marginal)
 
 
-@partial(jax.jit, static_argnames=("clusters", "restarts", "iterations", "ascents"))
+@partial(jax.jit, static_argnames=("n_components", "restarts", "iterations", "ascents"))
 def _em(
     key: Array,
     mdp: TabularMDP,
     counts: Float[Array, "n S A"],
-    eta: Float[Array, ""],
-    clusters: int,
+    rationality: Float[Array, ""],
+    n_components: int,
     restarts: int,
     iterations: int,
     ascents: int,
 ) -> tuple:
     def improve(mixture: Mixture, _: None) -> tuple:
-        responsibilities, log_likelihood = _e_step(mdp, mixture, counts, eta)
+        responsibilities, log_likelihood = _e_step(mdp, mixture, counts, rationality)
         visits = jnp.einsum("nd,nsa->dsa", responsibilities, counts)
-        weights = lax.map(lambda x: ascend(mdp, x[0], x[1], eta, ascents).weights, (visits, mixture.weights))
+        weights = lax.map(
+            lambda x: ascend(mdp, x[0], x[1], rationality, ascents).weights, (visits, mixture.weights)
+        )
         return Mixture(weights, jnp.mean(responsibilities, axis=0)), log_likelihood
 
     def from_start(key: Array) -> tuple:
-        keys = jax.random.split(key, clusters)
+        keys = jax.random.split(key, n_components)
         start = jax.vmap(random_weights, in_axes=(0, None))(keys, mdp.n_features)
-        first = Mixture(start, jnp.full(clusters, 1 / clusters))
+        first = Mixture(start, jnp.full(n_components, 1 / n_components))
         ends: tuple = lax.scan(improve, first, None, iterations)
         mixture, history = ends
-        responsibilities, log_likelihood = _e_step(mdp, mixture, counts, eta)
+        responsibilities, log_likelihood = _e_step(mdp, mixture, counts, rationality)
         return mixture, responsibilities, jnp.append(history, log_likelihood)
 
     return lax.map(from_start, jax.random.split(key, restarts))
@@ -255,8 +263,8 @@ def _em(
 def em_mlirl(
     mdp: TabularMDP,
     *,
-    clusters: int,
-    eta: float = ETA,
+    n_components: int,
+    rationality: float = ETA,
     iterations: int = 50,
     restarts: int = 1,
     ascents: int = 30,
@@ -271,9 +279,9 @@ def em_mlirl(
     Parameters
     ----------
     mdp : TabularMDP
-    clusters : int
+    n_components : int
         Number of ways, ``D``.
-    eta : float
+    rationality : float
         Inverse temperature of the experts, per unit of value.
     iterations, restarts : int
         EM iterations, and starts of which the likeliest is kept.
@@ -283,8 +291,8 @@ def em_mlirl(
     Returns
     -------
     EMMLIRL
-        ``fit`` raises ``ValueError`` for more clusters than trajectories, and ``DemonstrationError`` naming
-        trajectory and step for one that was not seen or that is impossible.
+        ``fit`` raises ``ValueError`` for more n_components than trajectories, and ``DemonstrationError``
+        naming trajectory and step for one that was not seen or that is impossible.
 
     Raises
     ------
@@ -292,21 +300,27 @@ def em_mlirl(
         For numbers that are not positive, or an undiscounted MDP.
     """
     require_discounted(mdp)
-    require_positive(clusters=clusters, eta=eta, iterations=iterations, restarts=restarts, ascents=ascents)
+    require_positive(
+        n_components=n_components,
+        rationality=rationality,
+        iterations=iterations,
+        restarts=restarts,
+        ascents=ascents,
+    )
     scale, scaled = feature_scale(mdp), with_scaled_features(mdp)
 
     def trace(key: Array, demonstration: Demonstration) -> EMTrace:
         counts = visit_counts(mdp, demonstration)
-        require_clusters(clusters, int((demonstration.lengths > 0).sum()))
+        require_components(n_components, int((demonstration.lengths > 0).sum()))
         # Rows of padding would count for the proportions.
         real = demonstration.lengths > 0
         mixtures, responsibilities, history = _em(
-            as_key(key), scaled, jnp.asarray(counts[real]), jnp.asarray(float(eta)),
-            clusters, restarts, iterations, ascents,
+            as_key(key), scaled, jnp.asarray(counts[real]), jnp.asarray(float(rationality)),
+            n_components, restarts, iterations, ascents,
         )  # fmt: skip
         best = int(np.argmax(history[:, -1]))
         proportions = np.asarray(responsibilities[best]).mean(0)
-        rows = np.broadcast_to(proportions, (len(real), clusters)).copy()
+        rows = np.broadcast_to(proportions, (len(real), n_components)).copy()
         rows[real] = responsibilities[best]
         clustering = Clustering(
             np.asarray(mixtures.weights[best] / scale), proportions, rows, float(history[best, -1])

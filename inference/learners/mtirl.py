@@ -22,7 +22,7 @@ from jaxtyping import Array, Float, Int
 from ...models.inputs.arguments import as_key
 from ...models.observation.demonstration import Demonstration, DemonstrationError
 from ...models.observation.evidence import (
-    Imperfection,
+    AnySensor,
     Sensor,
     checked_demonstration,
     fitting_sensor,
@@ -31,7 +31,7 @@ from ...models.observation.evidence import (
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import reachable_states, require_discounted
 from ...models.process.units import feature_scale, with_scaled_features
-from ..completion.explanations import Jumble, explain_each, is_seen_whole, seen_in_part, seen_whole
+from ..completion.explanations import Trajectories, explain_each, is_seen_whole, seen_in_part, seen_whole
 from ..mixtures.clustering import Clustering
 from ..mixtures.fit import (
     Assigned,
@@ -47,7 +47,7 @@ from ..mixtures.merging import Search, search
 from ..sessions.learner import Learner, digest_of, in_plain_numbers
 from ..sessions.scaling import on_scaled_features
 
-DEFAULT_WAYS = 4
+DEFAULT_COMPONENTS = 4
 DEFAULT_RESTARTS = 4
 # Experts are decided: a prior of scale 7 on each weight admits one who errs once in a thousand choices.
 DEFAULT_RIDGE = 0.02
@@ -84,7 +84,7 @@ class MixtureState(NamedTuple):
     key: Array
 
 
-class MixtureReport(NamedTuple):
+class MixtureInfo(NamedTuple):
     """What a session did; fields as in :class:`~i2rl.inference.Report`, where not said otherwise.
 
     Fields
@@ -105,7 +105,7 @@ class MixtureReport(NamedTuple):
     weights : float ``[D, K]``
     proportions : float ``[D]``
         Zero for empty slots.
-    ways : int
+    n_components : int
         How many there are now.
     starts : int
         How many starts were tried; one when nothing suggested a new way.
@@ -124,7 +124,7 @@ class MixtureReport(NamedTuple):
     seconds: float
     weights: Float[np.ndarray, "D K"]
     proportions: Float[np.ndarray, " D"]
-    ways: int
+    n_components: int
     starts: int
     assignments: Int[np.ndarray, " n"]
     responsibilities: Float[np.ndarray, "n D"]
@@ -132,12 +132,12 @@ class MixtureReport(NamedTuple):
 
 def mme_mtirl(
     mdp: TabularMDP,
-    sensor: Imperfection | None = None,
+    sensor: AnySensor | None = None,
     *,
-    ways: int = DEFAULT_WAYS,
+    n_components: int = DEFAULT_COMPONENTS,
     strength: float = 1.0,
-    price: float = 0.5,
-    l1: float = 0.0,
+    temperature: float = 0.5,
+    slack: float = 0.0,
     ridge: float = DEFAULT_RIDGE,
     restarts: int = DEFAULT_RESTARTS,
     iterations: int = 50,
@@ -154,16 +154,16 @@ def mme_mtirl(
         The task without its reward; discount below 1.
     sensor : Imperfection, optional
         What is hidden or misread; without it everything is seen.
-    ways : int
+    n_components : int
         Most ways there can be at a time, ``D``.
     strength : float
         ``lambda`` of the entropic prior on the proportions, ``exp(-lambda H(pi))``: the min-entropy half of
         program (5.1). The dissertation's is 1.
-    price : float
+    temperature : float
         What a nat of information of who did what costs, in nats of likelihood; see
         :mod:`~i2rl.inference.mixtures.fit`. 1 is the likelihood's own price, right for people who err; less
         prefers several decided ways to one undecided.
-    l1, ridge : float
+    slack, ridge : float
         Rate of a Laplace and precision of a Gaussian prior on each scaled weight (nats in all, not per
         trajectory), the reward in nats that a feature adds at most (:mod:`~i2rl.models.process.units`).
     restarts : int
@@ -186,47 +186,50 @@ def mme_mtirl(
     sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
 
     def build(mdp: TabularMDP) -> Learner:
-        program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
+        program = _program(
+            mdp, n_components, strength, temperature, slack, ridge, restarts, iterations, tolerance
+        )
         configuration = {
-            "ways": ways, "strength": strength, "price": price, "l1": l1, "ridge": ridge,
+            "n_components": n_components, "strength": strength, "temperature": temperature, "slack": slack,
+            "ridge": ridge,
             "restarts": restarts, "iterations": iterations, "tolerance": tolerance,
             "sensor": digest_of(sensor),
         }  # fmt: skip
-        return _learner(program, sensor, ways, restarts, configuration)
+        return _learner(program, sensor, n_components, restarts, configuration)
 
     return on_scaled_features(mdp, build)
 
 
 def _learner(
     program: MixtureProgram,
-    sensor: Imperfection,
-    ways: int,
+    sensor: AnySensor,
+    n_components: int,
     restarts: int,
     configuration: Mapping[str, Any],
 ) -> Learner:
     mdp = program.mdp
 
-    def session(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
-        jumble = seen_in_part(mdp, sensor, demonstration)
-        return _conclude(program, state, *_begin(program, state, jumble, restarts, search))
+    def session(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureInfo]:
+        trajectories = seen_in_part(mdp, sensor, demonstration)
+        return _conclude(program, state, *_begin(program, state, trajectories, restarts, search))
 
     def init(key: Array) -> MixtureState:
-        empty, kept = empty_mixture(mdp, ways), nothing_kept(mdp, ways)
+        empty, kept = empty_mixture(mdp, n_components), nothing_kept(mdp, n_components)
         return MixtureState(*empty, *kept, jnp.zeros((), int), as_key(key))
 
-    def update(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureReport]:
+    def update(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureInfo]:
         began = time.perf_counter()
         demonstration = checked_demonstration(mdp, demonstration, needed_by="multi-task learning")
         rows = np.flatnonzero(demonstration.lengths)
-        jumble = _gather(mdp, sensor, demonstration)
-        new, report = _concluded(program, state, *_begin(program, state, jumble, restarts, _searched))
-        if not np.isfinite(report.demonstration_log_likelihood):
+        trajectories = _gather(mdp, sensor, demonstration)
+        new, info = _concluded(program, state, *_begin(program, state, trajectories, restarts, _searched))
+        if not np.isfinite(info.demonstration_log_likelihood):
             _explain_impossible(sensor, mdp, demonstration)
-        report = report._replace(
-            assignments=np.asarray(report.assignments)[rows],
-            responsibilities=np.asarray(report.responsibilities)[rows],
+        info = info._replace(
+            assignments=np.asarray(info.assignments)[rows],
+            responsibilities=np.asarray(info.responsibilities)[rows],
         )
-        return new, in_plain_numbers(report, time.perf_counter() - began)
+        return new, in_plain_numbers(info, time.perf_counter() - began)
 
     @jax.jit
     def likelihood(state: MixtureState, weights: Float[Array, "D K"]) -> Float[Array, ""]:
@@ -255,41 +258,43 @@ class BatchMixture(NamedTuple):
 
 def batch_mme_mtirl(
     mdp: TabularMDP,
-    sensor: Imperfection | None = None,
+    sensor: AnySensor | None = None,
     *,
-    ways: int = DEFAULT_WAYS,
+    n_components: int = DEFAULT_COMPONENTS,
     strength: float = 1.0,
-    price: float = 0.5,
-    l1: float = 0.0,
+    temperature: float = 0.5,
+    slack: float = 0.0,
     ridge: float = DEFAULT_RIDGE,
     restarts: int = DEFAULT_RESTARTS,
     iterations: int = 50,
     tolerance: float = 1e-6,
 ) -> BatchMixture:
-    """Batch MME-MTIRL (section 5.1): the alternation from several seedings of ``ways`` ways, best one kept.
+    """Make batch MME-MTIRL (section 5.1): the alternation from several seedings, best one kept.
 
     Parameters as for :func:`mme_mtirl`. The :class:`Clustering` has the ways that were found, the largest
-    first, and the min-max-entropy program's objective ``J``. With fewer trajectories than ``ways``, there
-    is a warning, and at most one way a trajectory. ``fit`` raises :class:`DemonstrationError` as
+    first, and the min-max-entropy program's objective ``J``. With fewer trajectories than ``n_components``,
+    there is a warning, and at most one way a trajectory. ``fit`` raises :class:`DemonstrationError` as
     :func:`mme_mtirl` does.
     """
     sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
     scale = np.asarray(feature_scale(mdp))
     mdp = with_scaled_features(mdp)
-    program = _program(mdp, ways, strength, price, l1, ridge, restarts, iterations, tolerance)
-    nothing, empty = nothing_kept(mdp, ways), empty_mixture(mdp, ways)
+    program = _program(
+        mdp, n_components, strength, temperature, slack, ridge, restarts, iterations, tolerance
+    )
+    nothing, empty = nothing_kept(mdp, n_components), empty_mixture(mdp, n_components)
 
     def fit(key: Array, demonstration: Demonstration) -> Clustering:
         demonstration = checked_demonstration(mdp, demonstration, needed_by="multi-task learning")
         rows = np.flatnonzero(demonstration.lengths)
-        if len(rows) < ways:
+        if len(rows) < n_components:
             warnings.warn(
-                f"{ways} ways were to be started from, but there are {len(rows)} trajectories: no more ways "
+                f"`n_components` is {n_components}, but there are {len(rows)} trajectories: no more components "
                 "than that can be found",
                 stacklevel=2,
             )
-        jumble = _gather(mdp, sensor, demonstration)
-        found = _searched(program, jumble, nothing, empty, as_key(key), restarts).fit
+        trajectories = _gather(mdp, sensor, demonstration)
+        found = _searched(program, trajectories, nothing, empty, as_key(key), restarts).fit
         if not np.isfinite(found.objective):
             _explain_impossible(sensor, mdp, demonstration)
         proportions = np.asarray(found.mixture.proportions)
@@ -304,21 +309,21 @@ def batch_mme_mtirl(
     return BatchMixture("MME-MTIRL", fit)
 
 
-def clustering_of(state: MixtureState, report: MixtureReport) -> Clustering:
+def clustering_of(state: MixtureState, info: MixtureInfo) -> Clustering:
     """What an online learner has found, with the assignments of its last session; largest way first."""
     proportions = np.asarray(state.proportions)
     order = np.argsort(-proportions, kind="stable")[: np.count_nonzero(proportions)]
     return Clustering(
         np.asarray(state.weights)[order],
         proportions[order],
-        np.asarray(report.responsibilities)[:, order],
-        float(report.log_likelihood) * float(np.sum(state.mass)),
+        np.asarray(info.responsibilities)[:, order],
+        float(info.log_likelihood) * float(np.sum(state.mass)),
     )
 
 
 def assign_trajectories(
     mdp: TabularMDP,
-    sensor: Imperfection | None,
+    sensor: AnySensor | None,
     weights: Float[np.ndarray, "D K"],
     proportions: Float[np.ndarray, " D"],
     demonstration: Demonstration,
@@ -342,8 +347,8 @@ def assign_trajectories(
     sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
     demonstration = checked_demonstration(mdp, demonstration, needed_by="multi-task learning")
     rows = np.flatnonzero(demonstration.lengths)
-    jumble = _gather(mdp, sensor, demonstration)
-    assigned = _assigned(mdp, jnp.asarray(weights), jnp.asarray(proportions), jumble)
+    trajectories = _gather(mdp, sensor, demonstration)
+    assigned = _assigned(mdp, jnp.asarray(weights), jnp.asarray(proportions), trajectories)
     if not np.isfinite(assigned.log_likelihood).all():
         _explain_impossible(sensor, mdp, demonstration)
     return np.asarray(assigned.responsibilities)[rows]
@@ -351,10 +356,12 @@ def assign_trajectories(
 
 @jax.jit
 def _assigned(
-    mdp: TabularMDP, weights: Float[Array, "D K"], proportions: Float[Array, " D"], jumble: Jumble
+    mdp: TabularMDP, weights: Float[Array, "D K"], proportions: Float[Array, " D"], trajectories: Trajectories
 ) -> Assigned:
     policies, _ = log_policies(mdp, weights, jnp.zeros((len(weights), mdp.n_states)))
-    return assign(explain_each(mdp, policies, jumble).log_likelihood, proportions, jumble.live, 1.0)
+    return assign(
+        explain_each(mdp, policies, trajectories).log_likelihood, proportions, trajectories.live, 1.0
+    )
 
 
 # -- building blocks ----------------------------------------------------------------------------------
@@ -362,37 +369,42 @@ def _assigned(
 
 def _program(
     mdp: TabularMDP,
-    ways: int,
+    n_components: int,
     strength: float,
-    price: float,
-    l1: float,
+    temperature: float,
+    slack: float,
     ridge: float,
     restarts: int,
     iterations: int,
     tolerance: float,
 ) -> MixtureProgram:
     require_discounted(mdp)
-    for name, number in (("ways", ways), ("restarts", restarts), ("iterations", iterations)):
+    for name, number in (("n_components", n_components), ("restarts", restarts), ("iterations", iterations)):
         if not number >= 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
         if number != int(number):
             raise ValueError(f"{name} must be a whole number, got {number}")
-    for name, value in (("strength", strength), ("price", price), ("l1", l1), ("ridge", ridge)):
+    for name, value in (
+        ("strength", strength),
+        ("temperature", temperature),
+        ("slack", slack),
+        ("ridge", ridge),
+    ):
         if not 0 <= value < float("inf"):
             raise ValueError(f"{name} must be finite and not negative, got {value}")
     if np.isnan(tolerance):
         raise ValueError("tolerance must be a number of nats, got nan")
-    if price == 0:
+    if temperature == 0:
         raise ValueError("price must be more than zero: every trajectory would be a way of its own")
     reachable = jnp.asarray(reachable_states(mdp))
-    return MixtureProgram(mdp, reachable, strength, l1, ridge, price, iterations, tolerance)
+    return MixtureProgram(mdp, reachable, strength, slack, ridge, temperature, iterations, tolerance)
 
 
 _seen_whole, _seen_in_part = jax.jit(seen_whole), jax.jit(seen_in_part)
 
 
-def _gather(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration) -> Jumble:
-    padded, seen_by = demonstration.bucketed(), Sensor(sensor.presence, sensor.reading)
+def _gather(mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration) -> Trajectories:
+    padded, seen_by = demonstration.bucketed(), Sensor(sensor.visibility, sensor.noise)
     if not is_seen_whole(sensor, demonstration):
         return _seen_in_part(mdp, seen_by, padded)
     # Visits of a few trajectories more cost less than compiling for one shape more.
@@ -400,7 +412,7 @@ def _gather(mdp: TabularMDP, sensor: Imperfection, demonstration: Demonstration)
     return _seen_whole(mdp, seen_by, padded.padded(rows, padded.kind.shape[1]))
 
 
-def _explain_impossible(sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration) -> None:
+def _explain_impossible(sensor: AnySensor, mdp: TabularMDP, demonstration: Demonstration) -> None:
     require_possible(sensor, mdp, demonstration)
     raise DemonstrationError("a trajectory has probability zero under every way of doing the task")
 
@@ -410,12 +422,16 @@ _searched = jax.jit(search)
 
 
 def _begin(
-    program: MixtureProgram, state: MixtureState, jumble: Jumble, restarts: int, find: Callable[..., Search]
+    program: MixtureProgram,
+    state: MixtureState,
+    trajectories: Trajectories,
+    restarts: int,
+    find: Callable[..., Search],
 ) -> tuple[Search, Array]:
     key, seed = jax.random.split(state.key)
     kept = Kept(state.mass, state.visits)
     mixture = Mixture(state.weights, state.values, state.proportions)
-    return find(program, jumble, kept, mixture, seed, restarts), key
+    return find(program, trajectories, kept, mixture, seed, restarts), key
 
 
 def _kept_log_likelihood(
@@ -430,7 +446,7 @@ def _kept_log_likelihood(
 
 def _conclude(
     program: MixtureProgram, state: MixtureState, found: Search, key: Array
-) -> tuple[MixtureState, MixtureReport]:
+) -> tuple[MixtureState, MixtureInfo]:
     mdp, fit = program.mdp, found.fit
     mass = fit.kept.mass + jnp.sum(fit.responsibilities, axis=0)
     learned = MixtureState(*fit.mixture, mass, fit.kept.visits + fit.seen, state.session + 1, key)
@@ -451,14 +467,14 @@ def _conclude(
         "seconds": jnp.array(jnp.nan),
         "weights": fit.mixture.weights,
         "proportions": fit.mixture.proportions,
-        "ways": jnp.sum(present),
+        "n_components": jnp.sum(present),
         "starts": found.tried,
         "assignments": jnp.argmax(fit.responsibilities, axis=1),
         "responsibilities": fit.responsibilities,
     }
     # An observation that cannot be must not spoil what was learned (a fleet raises nothing).
     possible = jnp.isfinite(own)
-    return jax.tree.map(partial(jnp.where, possible), learned, state), MixtureReport(**fields)
+    return jax.tree.map(partial(jnp.where, possible), learned, state), MixtureInfo(**fields)
 
 
 _concluded = jax.jit(_conclude)

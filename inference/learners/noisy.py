@@ -25,8 +25,8 @@ from jaxtyping import Array, Bool, Float, Int
 from ...models.inputs.arguments import as_key
 from ...models.observation.demonstration import SEEN, Demonstration, DemonstrationError
 from ...models.observation.evidence import (
+    AnySensor,
     FeatureNoise,
-    Imperfection,
     Sensor,
     checked_demonstration,
     fitting_sensor,
@@ -67,7 +67,7 @@ DEFAULT_ERRORS = 0.25
 # Sessions are small: of each, one or two alternations are enough, and more make too much of its guesses.
 DEFAULT_ITERATIONS = 2
 # Exponent by which early guesses are forgotten.
-DEFAULT_MEMORY = 0.8
+DEFAULT_FORGETTING = 0.8
 # How often a predicate is thought to be reported rightly before the first session.
 DEFAULT_START = 0.75
 
@@ -103,7 +103,7 @@ class RIMEOState(NamedTuple):
     key: Array
 
 
-class RIMEOReport(NamedTuple):
+class RIMEOInfo(NamedTuple):
     """Numbers of a session, those of :class:`~i2rl.inference.Report` and of the sensor that was learned.
 
     Fields
@@ -131,7 +131,7 @@ def rimeo(
     mdp: TabularMDP,
     predicates: ArrayLike,
     *,
-    view: Imperfection | None = None,
+    view: AnySensor | None = None,
     reportable: ArrayLike | None = None,
     scores: Scores = "stepwise",
     truths: Truths = "posterior",
@@ -142,7 +142,7 @@ def rimeo(
     ridge: float = DEFAULT_RIDGE,
     errors: float = DEFAULT_ERRORS,
     start: ArrayLike = DEFAULT_START,
-    memory: float = DEFAULT_MEMORY,
+    forgetting: float = DEFAULT_FORGETTING,
     iterations: int = DEFAULT_ITERATIONS,
     tolerance: float = 1e-3,
     names: tuple[str, ...] | None = None,
@@ -181,7 +181,7 @@ def rimeo(
         a predicate that was never seen wrong from being thought infallible.
     start : float or float ``[J]``
         How often predicates are thought to be right before the first session.
-    memory : float
+    forgetting : float
         Exponent with which earlier sessions are kept, see :func:`~i2rl.inference.sessions.statistic.blend`.
     iterations, tolerance : int, float
         A session ends after so many alternations, or when no weight (relative to the largest) and no
@@ -226,10 +226,10 @@ def rimeo(
         perception = printed_perception(classes, psi, np.asarray(mdp.available))
     else:
         program = ObservationProgram(psi, reportable) if solver == "ipopt" else None
-        perception = entropic_perception(classes, scores, truths, errors, memory, program)
+        perception = entropic_perception(classes, scores, truths, errors, forgetting, program)
     configuration = {
         "scores": scores, "truths": truths, "unscored": unscored, "solver": solver, "statistic": statistic,
-        "slack": described(slack), "ridge": ridge, "errors": errors, "memory": memory,
+        "slack": described(slack), "ridge": ridge, "errors": errors, "forgetting": forgetting,
         "start": np.asarray(start, float).tolist(), "iterations": iterations, "tolerance": tolerance,
         "view": digest_of(seen), "predicates": digest_of(_half_sure(psi, reportable)),
     }  # fmt: skip
@@ -240,7 +240,7 @@ def rimeo(
         method = checked_method(mdp, seen, statistic, "exact", slack, ridge, 0)
         return _learner(
             name, method, perception, _half_sure(psi, reportable), configuration, first_logits,
-            memory, iterations, tolerance, solver, scores != "none" and not unscored,
+            forgetting, iterations, tolerance, solver, scores != "none" and not unscored,
         )  # fmt: skip
 
     return on_scaled_features(mdp, build)
@@ -251,12 +251,12 @@ def rifom(
     predicates: ArrayLike,
     *,
     form: Literal["fair", "coded"] = "fair",
-    view: Imperfection | None = None,
+    view: AnySensor | None = None,
     reportable: ArrayLike | None = None,
     statistic: str = "seen",
     slack: Schedule = 0.0,
     ridge: float = DEFAULT_RIDGE,
-    memory: float = DEFAULT_MEMORY,
+    forgetting: float = DEFAULT_FORGETTING,
     iterations: int = DEFAULT_ITERATIONS,
     tolerance: float = 1e-3,
     names: tuple[str, ...] | None = None,
@@ -276,7 +276,8 @@ def rifom(
     ways = {"fair": counted_perception, "coded": coded_perception}
     perception = ways[form](report_classes(psi, reportable), psi)
     configuration = {
-        "form": form, "statistic": statistic, "slack": described(slack), "ridge": ridge, "memory": memory,
+        "form": form, "statistic": statistic, "slack": described(slack), "ridge": ridge,
+        "forgetting": forgetting,
         "iterations": iterations, "tolerance": tolerance, "view": digest_of(seen),
         "predicates": digest_of(_half_sure(psi, reportable)),
     }  # fmt: skip
@@ -286,20 +287,20 @@ def rifom(
         method = checked_method(mdp, seen, statistic, "exact", slack, ridge, 0)
         return _learner(
             f"RIFOM ({form})", method, perception, _half_sure(psi, reportable), configuration,
-            first_logits, memory, iterations, tolerance, "newton", False,
+            first_logits, forgetting, iterations, tolerance, "newton", False,
         )  # fmt: skip
 
     return on_scaled_features(mdp, build)
 
 
-def robust_irl(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Batch:
+def robust_irl(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Batch:
     """Robust IRL (Eqs. 6.3 and 6.4): the sensor is known, and all trajectories are there at once.
 
     Batch latent maximum-entropy IRL under that sensor; options and errors as of
     :func:`~i2rl.inference.batch_lme`. Raises ``ValueError`` for a sensor without an observation model.
     """
     sensor = fitting_sensor(sensor, mdp)
-    if sensor.reading is None:
+    if sensor.noise is None:
         raise ValueError("robust IRL needs a sensor with an observation model; this one reports exactly")
     return batch_lme(mdp, sensor, **options)._replace(name="Robust IRL")
 
@@ -307,11 +308,11 @@ def robust_irl(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Batch:
 # -- building blocks ----------------------------------------------------------------------------------
 
 
-def _checked_view(mdp: TabularMDP, view: Imperfection | None, slack: Schedule) -> Imperfection:
+def _checked_view(mdp: TabularMDP, view: AnySensor | None, slack: Schedule) -> AnySensor:
     require_discounted(mdp)
     require_slack(slack)
     seen = Sensor() if view is None else Sensor() * view
-    if seen.reading is not None:
+    if seen.noise is not None:
         raise ValueError("the view says what is hidden; how reports err is learned, not given")
     return fitting_sensor(seen, mdp)
 
@@ -384,7 +385,7 @@ class _Alternation(NamedTuple):
 
     method: Method
     perception: Perception
-    memory: float
+    forgetting: float
 
     def prepare(self, state: RIMEOState, demonstration: Any) -> tuple[PreparedSession, Array]:
         session = prepare(self.method.mdp, self.perception.classes, demonstration, self.perception.scored)
@@ -401,7 +402,7 @@ class _Alternation(NamedTuple):
     ) -> tuple[Any, Any]:
         """The demonstration and its reports under a plan and reliabilities."""
         evidence = report_log_evidence(
-            self.perception.classes, logits, session.reports, confidence, self.method.sensor.presence
+            self.perception.classes, logits, session.reports, confidence, self.method.sensor.visibility
         )
         posterior = smooth_all(self.method.mdp, plan.log_policy, Evidence(evidence, session.live))
         completed = complete(self.method.mdp, posterior, session.live, session.reports.seen)
@@ -414,7 +415,7 @@ class _Alternation(NamedTuple):
         mdp, statistic = self.method.mdp, self.method.statistic
         plan = self.method.plan(point.weights, point.values)
         completed, reports = self.complete(session, confidence, plan, point.logits)
-        working = blend(state.statistic, statistic.of_session(mdp, plan, completed), self.memory)
+        working = blend(state.statistic, statistic.of_session(mdp, plan, completed), self.forgetting)
         gradient = lax.cond(
             point.iterations == 0,
             lambda: self.method.gradient(point.weights, plan.values, working),
@@ -439,13 +440,13 @@ class _Alternation(NamedTuple):
 
     def close(
         self, state: RIMEOState, session: PreparedSession, confidence: Array, point: _Point, program: Any
-    ) -> tuple[RIMEOState, RIMEOReport]:
+    ) -> tuple[RIMEOState, RIMEOInfo]:
         """End a session: complete it once more, under its own result, and keep the statistics."""
         mdp, statistic = self.method.mdp, self.method.statistic
         plan = self.method.plan(point.weights, point.values)
         completed, reports = self.complete(session, confidence, plan, point.logits)
         own = jnp.sum(completed.expectations.log_likelihood)
-        kept = blend(state.statistic, statistic.to_keep(mdp, plan, completed), self.memory)
+        kept = blend(state.statistic, statistic.to_keep(mdp, plan, completed), self.forgetting)
         heard = self.perception.blend(state.reports, reports)
         number = state.session + 1
         report: dict[str, Any] = {
@@ -467,7 +468,7 @@ class _Alternation(NamedTuple):
         # A report that cannot be must not spoil what was learned (a fleet raises nothing).
         possible = jnp.isfinite(own)
         spared = state._replace(program=program)
-        return jax.tree.map(partial(jnp.where, possible), learned, spared), RIMEOReport(**report)
+        return jax.tree.map(partial(jnp.where, possible), learned, spared), RIMEOInfo(**report)
 
 
 def _learner(
@@ -477,7 +478,7 @@ def _learner(
     reporting: FeatureNoise,
     configuration: Mapping[str, Any],
     first_logits: Float[Array, " J"],
-    memory: float,
+    forgetting: float,
     iterations: int,
     tolerance: float,
     solver: str,
@@ -485,12 +486,12 @@ def _learner(
 ) -> Learner:
     if iterations < 1:
         raise ValueError(f"a session needs at least one iteration, got {iterations}")
-    if not 0 < memory <= 1:
-        raise ValueError(f"memory is an exponent in (0, 1], got {memory}")
+    if not 0 < forgetting <= 1:
+        raise ValueError(f"memory is an exponent in (0, 1], got {forgetting}")
     mdp = method.mdp
-    parts = _Alternation(method, perception, memory)
+    parts = _Alternation(method, perception, forgetting)
 
-    def session(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOReport]:
+    def session(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOInfo]:
         prepared, confidence = parts.prepare(state, demonstration)
 
         def step(point: _Point) -> _Point:
@@ -506,7 +507,7 @@ def _learner(
         point = lax.while_loop(unfinished, step, parts.first(state))
         return parts.close(state, prepared, confidence, point, state.program)
 
-    run: Callable[[RIMEOState, Any], tuple[RIMEOState, RIMEOReport]]
+    run: Callable[[RIMEOState, Any], tuple[RIMEOState, RIMEOInfo]]
     if solver == "newton":
         run, warm = jax.jit(session), ()
     else:
@@ -519,7 +520,7 @@ def _learner(
             perception.empty, warm, jnp.zeros((), int), key,
         )  # fmt: skip
 
-    def update(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOReport]:
+    def update(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOInfo]:
         began = time.perf_counter()
         seen = _checked_session(
             mdp, name, demonstration, scores_needed, configuration.get("truths") == "oracle"
@@ -558,14 +559,14 @@ def _learner(
 
 def _outside(
     parts: _Alternation, iterations: int, tolerance: float
-) -> tuple[Callable[[RIMEOState, Any], tuple[RIMEOState, RIMEOReport]], Any]:
+) -> tuple[Callable[[RIMEOState, Any], tuple[RIMEOState, RIMEOInfo]], Any]:
     """A session whose two programs are solved by IPOPT, and its first warm starts."""
     method, perception = parts.method, parts.perception
     solve, empty = host_solver(method.mdp, "ipopt", method.statistic.name)
     opening, expect = jax.jit(parts.prepare), jax.jit(parts.expect)
     advance, closing = jax.jit(parts.advance), jax.jit(parts.close)
 
-    def run(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOReport]:
+    def run(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOInfo]:
         rewards, sensor = state.program
         state = state._replace(program=())
         prepared, confidence = opening(state, demonstration)

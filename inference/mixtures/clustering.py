@@ -18,7 +18,7 @@ class Clustering(NamedTuple):
     proportions : float ``[D]``
         Mixture weights ``pi_d``; they sum to one.
     responsibilities : float ``[n, D]``
-        ``v_{d,i}``: probability that trajectory ``i`` was done in way ``d``; rows sum to one.
+        ``v_{d,i}``: probability that trajectory ``i`` was done in component ``d``; rows sum to one.
     objective : float
         What the method maximised, in nats.
     """
@@ -29,7 +29,7 @@ class Clustering(NamedTuple):
     objective: float
 
     @property
-    def n_clusters(self) -> int:
+    def n_components(self) -> int:
         """Number of ways found, ``D``."""
         return len(self.weights)
 

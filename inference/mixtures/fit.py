@@ -8,17 +8,17 @@ The sound form of program (5.1). Given trajectories and, online, what is kept of
         - sum_d (l1 |theta_d|_1 + ridge/2 |theta_d|^2)
 
 (``n_d``, ``N_d``: mass and visits kept of earlier sessions). The E-step makes ``v_{d,i}`` proportional to
-``pi_d P(X_i; theta_d)^(1/price)``; the M-steps are
+``pi_d P(X_i; theta_d)^(1/temperature)``; the M-steps are
 :func:`~i2rl.inference.programs.entropic.entropic_proportions` and one maximum-entropy program per way
 (:func:`~i2rl.inference.programs.maximum_entropy.fit_counts`). ``J`` never falls while the ways stay the same.
 Features are scaled (:mod:`~i2rl.models.process.units`), so penalties are of scaled weights.
 
-*How many ways.* With ``price`` 1, ``J`` is the likelihood of a mixture, and that cannot tell a sorter who
-flips a coin once and then sticks to it from two sorters who know what they want: the first costs ``log 2``
-nats of indecision, the second ``log 2`` nats to say which sorter it was. Mixtures of rewards are about people
-who know what they want, so the information of who did what is charged at less than its price (a point further
-along the same rate-distortion curve). :mod:`~i2rl.inference.mixtures.merging` decides how many ways there
-are.
+*How many ways.* With ``temperature`` 1, ``J`` is the likelihood of a mixture, and that cannot tell a sorter
+who flips a coin once and then sticks to it from two sorters who know what they want: the first costs ``log
+2`` nats of indecision, the second ``log 2`` nats to say which sorter it was. Mixtures of rewards are about
+people who know what they want, so the information of who did what is charged at less than its price (a point
+further along the same rate-distortion curve). :mod:`~i2rl.inference.mixtures.merging` decides how many ways
+there are.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import reward_of, soft_plan
-from ..completion.explanations import Jumble, explain_each
+from ..completion.explanations import Trajectories, explain_each
 from ..programs.entropic import entropic_proportions
 from ..programs.maximum_entropy import WarmStart, fit_scaled_counts
 
@@ -47,9 +47,9 @@ class MixtureProgram(NamedTuple):
     mdp: TabularMDP
     reachable: Bool[Array, " S"]
     strength: Array | float
-    l1: Array | float
+    slack: Array | float
     ridge: Array | float
-    price: Array | float
+    temperature: Array | float
     iterations: Array | int
     tolerance: Array | float
 
@@ -106,14 +106,18 @@ class Fit(NamedTuple):
     converged: Bool[Array, ""]
 
 
-def nothing_kept(mdp: TabularMDP, ways: int) -> Kept:
+def nothing_kept(mdp: TabularMDP, n_components: int) -> Kept:
     """The statistic before the first trajectory."""
-    return Kept(jnp.zeros(ways), jnp.zeros((ways, mdp.n_states, mdp.n_actions)))
+    return Kept(jnp.zeros(n_components), jnp.zeros((n_components, mdp.n_states, mdp.n_actions)))
 
 
-def empty_mixture(mdp: TabularMDP, ways: int) -> Mixture:
+def empty_mixture(mdp: TabularMDP, n_components: int) -> Mixture:
     """So many empty slots."""
-    return Mixture(jnp.zeros((ways, mdp.n_features)), jnp.zeros((ways, mdp.n_states)), jnp.zeros(ways))
+    return Mixture(
+        jnp.zeros((n_components, mdp.n_features)),
+        jnp.zeros((n_components, mdp.n_states)),
+        jnp.zeros(n_components),
+    )
 
 
 # -- the two steps ------------------------------------------------------------------------------------
@@ -148,17 +152,17 @@ def assign(
     log_likelihood: Float[Array, "D n"],
     proportions: Float[Array, " D"],
     live: Bool[Array, " n"],
-    price: Array | float,
+    temperature: Array | float,
 ) -> Assigned:
     """The E-step, given the log-likelihood of every trajectory under every way."""
     present = jnp.where(proportions > 0, _finite_log(proportions), -jnp.inf)
-    joint = log_likelihood.T / price + present
+    joint = log_likelihood.T / temperature + present
     total = jax.nn.logsumexp(joint, axis=1)
     possible = jnp.isfinite(total)
     shares = jnp.exp(joint - jnp.where(possible, total, 0.0)[:, None])
     return Assigned(
         jnp.where((live & possible)[:, None], shares, 0.0),
-        jnp.where(live, price * total, 0.0),
+        jnp.where(live, temperature * total, 0.0),
         jnp.where(live, jax.nn.logsumexp(log_likelihood.T + present, axis=1), 0.0),
     )
 
@@ -170,7 +174,7 @@ def proportions_of(program: MixtureProgram, mass: Float[Array, " D"]) -> Float[A
 
 def penalty(program: MixtureProgram, weights: Float[Array, "*D K"]) -> Float[Array, ""]:
     """What the priors on the weights take off ``J``, in nats."""
-    return program.l1 * jnp.sum(jnp.abs(weights)) + program.ridge / 2 * jnp.sum(weights**2)
+    return program.slack * jnp.sum(jnp.abs(weights)) + program.ridge / 2 * jnp.sum(weights**2)
 
 
 def objective_of(
@@ -183,7 +187,7 @@ def objective_of(
     return (
         jnp.sum(assigned.value)
         + known
-        + program.price * (kept.mass @ _finite_log(proportions) + entropic)
+        + program.temperature * (kept.mass @ _finite_log(proportions) + entropic)
         - penalty(program, weights)
     )
 
@@ -194,7 +198,7 @@ def _collected(responsibilities: Float[Array, "n D"], visits: Float[Array, "D n 
 
 def e_step(
     program: MixtureProgram,
-    jumble: Jumble,
+    trajectories: Trajectories,
     kept: Kept,
     mixture: Mixture,
     before: Float[Array, ""],
@@ -204,8 +208,8 @@ def e_step(
     """Who did what under these ways, and ``J``; ``before`` is the ``J`` to compare with."""
     policies, values = log_policies(program.mdp, mixture.weights, mixture.values)
     mixture = mixture._replace(values=values)
-    explained = explain_each(program.mdp, policies, jumble, mixture.proportions > 0)
-    assigned = assign(explained.log_likelihood, mixture.proportions, jumble.live, program.price)
+    explained = explain_each(program.mdp, policies, trajectories, mixture.proportions > 0)
+    assigned = assign(explained.log_likelihood, mixture.proportions, trajectories.live, program.temperature)
     objective = objective_of(program, kept, mixture, policies, assigned)
     shares = assigned.responsibilities
     return Fit(
@@ -225,7 +229,7 @@ def _m_step(
 
     def reward(inputs: tuple) -> tuple:
         counts, *start = inputs
-        solution = fit_scaled_counts(program.mdp, counts, program.l1, program.ridge, WarmStart(*start))
+        solution = fit_scaled_counts(program.mdp, counts, program.slack, program.ridge, WarmStart(*start))
         return solution.weights, solution.values, solution.iterations, solution.converged
 
     fitted = lax.map(reward, (kept.visits + visits, mixture.weights, mixture.values))
@@ -235,7 +239,7 @@ def _m_step(
 
 def climb(
     program: MixtureProgram,
-    jumble: Jumble,
+    trajectories: Trajectories,
     kept: Kept,
     mixture: Mixture,
     responsibilities: Float[Array, "n D"],
@@ -247,17 +251,19 @@ def climb(
         mass = jnp.sum(fit.responsibilities, axis=0)
         new, spent, converged = _m_step(program, kept, fit.mixture, mass, fit.visits)
         counted = (fit.iterations + 1, fit.solver_iterations + spent)
-        return e_step(program, jumble, kept, new, fit.objective, *counted)._replace(converged=converged)
+        return e_step(program, trajectories, kept, new, fit.objective, *counted)._replace(converged=converged)
 
     def unfinished(fit: Fit) -> Bool[Array, ""]:
         return (fit.gain > program.tolerance) & (fit.iterations < program.iterations)
 
-    return lax.while_loop(unfinished, step, unmade(program, jumble, kept, mixture, responsibilities, visits))
+    return lax.while_loop(
+        unfinished, step, unmade(program, trajectories, kept, mixture, responsibilities, visits)
+    )
 
 
 def unmade(
     program: MixtureProgram,
-    jumble: Jumble,
+    trajectories: Trajectories,
     kept: Kept,
     mixture: Mixture,
     responsibilities: Array,
@@ -265,7 +271,7 @@ def unmade(
 ) -> Fit:
     """A fit that is still to be made: assignments alone."""
     nowhere, zero = jnp.array(-jnp.inf), jnp.zeros((), int)
-    unknown = jnp.zeros(jumble.live.shape)
+    unknown = jnp.zeros(trajectories.live.shape)
     return Fit(
         mixture, kept, responsibilities, visits, visits, unknown, nowhere, nowhere, -nowhere, zero, zero,
         jnp.array(True),

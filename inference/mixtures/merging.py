@@ -2,8 +2,8 @@
 
 The climb of :mod:`~i2rl.inference.mixtures.fit` starts from more ways than needed, and two are merged as long
 as the score gains by it: ``J`` less Laplace's estimate of what each reward costs, ``log det(1 + F_d / ridge)
-/ 2`` (``F_d``: information about ``theta_d`` in the visits of way ``d``). Without that, experts who are not
-decided are split by their chance choices.
+/ 2`` (``F_d``: information about ``theta_d`` in the visits of component ``d``). Without that, experts who
+are not decided are split by their chance choices.
 """
 
 from __future__ import annotations
@@ -17,7 +17,14 @@ from jax.scipy.special import xlogy
 from jaxtyping import Array, Bool, Float, Int
 
 from ...models.process.planning import hard_plan, reward_of, soft_plan
-from ..completion.explanations import Explained, Jumble, SeenWhole, explain, explain_each, without_reward
+from ..completion.explanations import (
+    Explained,
+    SeenWhole,
+    Trajectories,
+    explain,
+    explain_each,
+    without_reward,
+)
 from ..programs.maximum_entropy import WarmStart, count_information, fit_scaled_counts
 from .fit import (
     Fit,
@@ -60,12 +67,12 @@ def _occam(
 ) -> Float[Array, ""]:
     information = count_information(program.mdp, visits, weights, values)
     # A Laplace prior counts as the Gaussian of the same variance.
-    precision = jnp.maximum(program.ridge + program.l1**2 / 2, _LEAST_PRECISION)
+    precision = jnp.maximum(program.ridge + program.slack**2 / 2, _LEAST_PRECISION)
     return 0.5 * jnp.linalg.slogdet(jnp.eye(len(weights)) + information / precision)[1]
 
 
 def _merged(fit: Fit, a: Int[Array, ""], b: Int[Array, ""]) -> tuple[Kept, Array, Array]:
-    """What is kept, the assignments and the visits when way ``b`` becomes part of way ``a``."""
+    """What is kept, the assignments and the visits when way ``b`` becomes part of component ``a``."""
 
     def pour(x: Array) -> Array:
         return x.at[a].add(x[b]).at[b].set(0.0)
@@ -79,16 +86,18 @@ def _best_possible(visits: Float[Array, "S A"]) -> Float[Array, ""]:
     return jnp.sum(xlogy(visits, visits)) - jnp.sum(xlogy(visits.sum(1), visits.sum(1)))
 
 
-def merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Array, Fit, Array]:
+def merge_once(program: MixtureProgram, trajectories: Trajectories, fit: Fit) -> tuple[Array, Fit, Array]:
     """The best of all mergers of two ways, refitted (one reward) but not climbed from; whether to take it.
 
     Ways whose greedy policies agree in every reachable state are one, whatever the score says.
     """
-    mdp, ways = program.mdp, fit.mixture.proportions.shape[0]
-    pairs = jnp.array([(a, b) for a in range(ways) for b in range(a + 1, ways)], int).reshape(-1, 2)
+    mdp, n_components = program.mdp, fit.mixture.proportions.shape[0]
+    pairs = jnp.array([(a, b) for a in range(n_components) for b in range(a + 1, n_components)], int).reshape(
+        -1, 2
+    )
     weights, values, proportions = fit.mixture
     policies, _ = log_policies(mdp, weights, values)
-    explained = explain_each(mdp, policies, jumble, proportions > 0)
+    explained = explain_each(mdp, policies, trajectories, proportions > 0)
     greedy = lax.map(lambda w: jnp.argmax(hard_plan(mdp, reward_of(mdp, w)).optimal, axis=1), weights)
     complexity = _complexity(program, fit.mixture, fit.kept.visits + fit.visits)
     score = fit.objective - jnp.sum(complexity)
@@ -109,7 +118,7 @@ def merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Array
 
         def refit() -> _Trial:
             start = WarmStart(weights[a], values[a])
-            solution = fit_scaled_counts(mdp, together, program.l1, program.ridge, start)
+            solution = fit_scaled_counts(mdp, together, program.slack, program.ridge, start)
             proportion = proportions_of(program, kept.mass + jnp.sum(shares, axis=0))
             new = Mixture(
                 weights.at[a].set(solution.weights).at[b].set(0.0),
@@ -117,9 +126,9 @@ def merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Array
                 proportion,
             )
             policy = soft_plan(mdp, reward_of(mdp, solution.weights), solution.values).log_policy
-            changed = explain(mdp, policy, jumble)
+            changed = explain(mdp, policy, trajectories)
             likely = explained.log_likelihood.at[a].set(changed.log_likelihood)
-            fresh = assign(likely, proportion, jumble.live, program.price)
+            fresh = assign(likely, proportion, trajectories.live, program.temperature)
             objective = objective_of(program, kept, new, policies.at[a].set(policy), fresh)
             costs = complexity.at[a].set(_occam(program, solution.weights, solution.values, together))
             return _Trial(objective - jnp.sum(costs.at[b].set(0.0)), new, kept, shares, visits)
@@ -127,15 +136,15 @@ def merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Array
         alive = (proportions[a] > 0) & (proportions[b] > 0)
         same = jnp.all((greedy[a] == greedy[b]) | ~program.reachable)
         worth = alive
-        if isinstance(jumble, SeenWhole):
+        if isinstance(trajectories, SeenWhole):
             # No policy at all could explain both well enough: then no reward's policy does.
             mass = fit.kept.mass + jnp.sum(fit.responsibilities, axis=0)
             pair_mass = mass[a] + mass[b]
             saved = xlogy(pair_mass, pair_mass) - xlogy(mass[a], mass[a]) - xlogy(mass[b], mass[b])
             lost = own[a] + own[b] - _best_possible(together)
-            spared = program.price * program.strength + complexity[a] + complexity[b]
+            spared = program.temperature * program.strength + complexity[a] + complexity[b]
             spared += penalty(program, weights[a]) + penalty(program, weights[b])
-            worth &= same | (lost <= program.price * saved + spared)
+            worth &= same | (lost <= program.temperature * saved + spared)
         trial = lax.cond(worth, refit, lambda: nothing)
         return trial._replace(score=jnp.where(worth & same, jnp.inf, trial.score))
 
@@ -148,12 +157,14 @@ def merge_once(program: MixtureProgram, jumble: Jumble, fit: Fit) -> tuple[Array
     return jnp.isfinite(score) & (best.score >= score - program.tolerance), merged, score
 
 
-def settle(program: MixtureProgram, jumble: Jumble, start: Fit) -> Fit:
+def settle(program: MixtureProgram, trajectories: Trajectories, start: Fit) -> Fit:
     """Climb; merge two ways and climb again, as long as that gains."""
 
     def step(carry: tuple) -> tuple:
         before, _ = carry
-        fit = climb(program, jumble, before.kept, before.mixture, before.responsibilities, before.visits)
+        fit = climb(
+            program, trajectories, before.kept, before.mixture, before.responsibilities, before.visits
+        )
         fit = fit._replace(
             iterations=before.iterations + fit.iterations,
             solver_iterations=before.solver_iterations + fit.solver_iterations,
@@ -161,7 +172,7 @@ def settle(program: MixtureProgram, jumble: Jumble, start: Fit) -> Fit:
         if start.mixture.proportions.shape[0] == 1:
             complexity = _complexity(program, fit.mixture, fit.kept.visits + fit.visits)
             return fit._replace(score=fit.objective - jnp.sum(complexity)), jnp.array(False)
-        better, merged, score = merge_once(program, jumble, fit)
+        better, merged, score = merge_once(program, trajectories, fit)
         fit = fit._replace(score=score)
         return jax.tree.map(lambda x, y: jnp.where(better, x, y), merged, fit), better
 
@@ -171,7 +182,7 @@ def settle(program: MixtureProgram, jumble: Jumble, start: Fit) -> Fit:
 # -- where to start -----------------------------------------------------------------------------------
 
 
-def seed_ways(
+def seed_components(
     key: Array,
     points: Float[Array, "n K"],
     live: Bool[Array, " n"],
@@ -183,7 +194,7 @@ def seed_ways(
     ``centres`` and ``mass`` describe the ways known so far; slots without mass are filled with trajectories
     drawn in proportion to their squared distance from what is there (Arthur and Vassilvitskii 2007).
     """
-    ways = mass.shape[0]
+    n_components = mass.shape[0]
 
     def distances(centres: Float[Array, "D K"], open_: Bool[Array, " D"]) -> Float[Array, "n D"]:
         squared = jnp.sum((points[:, None] - centres) ** 2, axis=-1)
@@ -200,8 +211,8 @@ def seed_ways(
         return (centres, open_.at[slot].set(True)), None
 
     def assigned(centres: Float[Array, "D K"]) -> Float[Array, "n D"]:
-        nearest = jnp.argmin(distances(centres, jnp.ones(ways, bool)), axis=1)
-        return jax.nn.one_hot(nearest, ways) * live[:, None]
+        nearest = jnp.argmin(distances(centres, jnp.ones(n_components, bool)), axis=1)
+        return jax.nn.one_hot(nearest, n_components) * live[:, None]
 
     def settle(_: int, means: Float[Array, "D K"]) -> Float[Array, "D K"]:
         shares = assigned(means)
@@ -210,13 +221,13 @@ def seed_ways(
         return jnp.where(size[:, None] > 0, total / jnp.maximum(size, 1e-300)[:, None], means)
 
     # Known ways come first, wherever their slots are: new ones are to be far from all of them.
-    slots = (jax.random.split(key, ways), jnp.arange(ways))
+    slots = (jax.random.split(key, n_components), jnp.arange(n_components))
     (filled, _), _ = lax.scan(fill, (centres, mass > 0), slots)
     return assigned(lax.fori_loop(0, 10, settle, filled))
 
 
 def _seeded(
-    program: MixtureProgram, jumble: Jumble, guess: Explained, kept: Kept, key: Array
+    program: MixtureProgram, trajectories: Trajectories, guess: Explained, kept: Kept, key: Array
 ) -> tuple[Float[Array, "n D"], Float[Array, "D S A"]]:
     """Assignments by features per step, as far as these are known before any reward is."""
 
@@ -224,7 +235,7 @@ def _seeded(
         steps = jnp.maximum(jnp.sum(visits, axis=(-2, -1)), 1e-300)
         return jnp.einsum("...sa,sak->...k", visits, program.mdp.features) / steps[..., None]
 
-    shares = seed_ways(key, per_step(guess.visits), jumble.live, per_step(kept.visits), kept.mass)
+    shares = seed_components(key, per_step(guess.visits), trajectories.live, per_step(kept.visits), kept.mass)
     return shares, jnp.einsum("nd,nsa->dsa", shares, guess.visits)
 
 
@@ -236,7 +247,12 @@ class Search(NamedTuple):
 
 
 def search(
-    program: MixtureProgram, jumble: Jumble, kept: Kept, mixture: Mixture, key: Array, restarts: Array | int
+    program: MixtureProgram,
+    trajectories: Trajectories,
+    kept: Kept,
+    mixture: Mixture,
+    key: Array,
+    restarts: Array | int,
 ) -> Search:
     """Find ways of doing the task: from those known and, if some may be hidden, from ``restarts`` seedings.
 
@@ -244,39 +260,41 @@ def search(
     are none yet, are the empty slots filled, ``restarts`` times over; the best fit is returned.
     """
     known = jnp.any(kept.mass > 0)
-    guess = without_reward(program.mdp, jumble)
+    guess = without_reward(program.mdp, trajectories)
 
     nowhere, zero = jnp.array(-jnp.inf), jnp.zeros((), int)
-    expected = e_step(program, jumble, kept, mixture, nowhere, zero, zero)
-    suspicious = ~known | may_hide_a_way(program, jumble, expected)
+    expected = e_step(program, trajectories, kept, mixture, nowhere, zero, zero)
+    suspicious = ~known | may_hide_a_component(program, trajectories, expected)
 
     def step(carry: tuple) -> tuple:
         number, best, last, _ = carry
         shares, visits = lax.cond(
             (number == 0) & known,
             lambda: (expected.responsibilities, expected.visits),
-            lambda: _seeded(program, jumble, guess, kept, jax.random.fold_in(key, number)),
+            lambda: _seeded(program, trajectories, guess, kept, jax.random.fold_in(key, number)),
         )
-        fresh = unmade(program, jumble, kept, mixture, shares, visits)
+        fresh = unmade(program, trajectories, kept, mixture, shares, visits)
         # The last round of several continues the best of the others, until it stands still.
         start = jax.tree.map(lambda x, y: jnp.where(last & suspicious, x, y), best, fresh)
         tolerance = jnp.where(last, program.tolerance, jnp.maximum(program.tolerance, _LOOSE))
-        fit = settle(program._replace(tolerance=tolerance), jumble, start)
+        fit = settle(program._replace(tolerance=tolerance), trajectories, start)
         best = jax.tree.map(lambda x, y: jnp.where(last | (fit.score > best.score), x, y), fit, best)
         # Without an empty slot there is nothing to seed.
         more = suspicious & ((number > 0) | ~known | jnp.any(fit.mixture.proportions == 0))
         tried = number + ~(last & suspicious)
         return tried, best, ~(more & (tried < restarts + known)), last
 
-    n_ways = mixture.proportions.shape[0]
-    nobody = (jnp.zeros((*jumble.live.shape, n_ways)), jnp.zeros_like(kept.visits))
-    none = unmade(program, jumble, kept, mixture, *nobody)
+    n_components = mixture.proportions.shape[0]
+    nobody = (jnp.zeros((*trajectories.live.shape, n_components)), jnp.zeros_like(kept.visits))
+    none = unmade(program, trajectories, kept, mixture, *nobody)
     begin = (jnp.zeros((), int), none, ~suspicious, jnp.array(False))
     tried, best, _, _ = lax.while_loop(lambda carry: ~carry[3], step, begin)
     return Search(best, tried)
 
 
-def may_hide_a_way(program: MixtureProgram, jumble: Jumble, expected: Fit) -> Bool[Array, ""]:
+def may_hide_a_component(
+    program: MixtureProgram, trajectories: Trajectories, expected: Fit
+) -> Bool[Array, ""]:
     """Whether known ways, not yet adapted, explain trajectories so badly that a new way could pay.
 
     At best a new way predicts every action of the trajectories that it takes over; what is kept is explained
@@ -285,7 +303,7 @@ def may_hide_a_way(program: MixtureProgram, jumble: Jumble, expected: Fit) -> Bo
     seen count as the known ways guess them: a way that differs only where nobody looks is not suspected.)
     """
     policies, _ = log_policies(program.mdp, expected.mixture.weights, expected.mixture.values)
-    explained = explain_each(program.mdp, policies, jumble, expected.mixture.proportions > 0)
+    explained = explain_each(program.mdp, policies, trajectories, expected.mixture.proportions > 0)
     surprise = -jnp.where(program.mdp.available, policies, 0.0)
     loss = jnp.einsum("nd,dnsa,dsa->n", expected.responsibilities, explained.visits, surprise)
     worst = jnp.argsort(-loss)
@@ -298,5 +316,5 @@ def may_hide_a_way(program: MixtureProgram, jumble: Jumble, expected: Fit) -> Bo
     undecided = jnp.cumsum(jnp.sum(xlogy(shares, shares), axis=1))
     information = jnp.sum(xlogy(mass, mass / total)) - jnp.sum(xlogy(left, left / total), axis=1)
     information = information - xlogy(number, number / total) - undecided
-    pays = jnp.cumsum(loss[worst]) > program.price * information + program.tolerance
+    pays = jnp.cumsum(loss[worst]) > program.temperature * information + program.tolerance
     return jnp.any(pays & (number > 0))

@@ -31,7 +31,7 @@ from ...models.laws.mixture import (
 )
 from ...models.laws.occlusion import ScaledPrior
 from ...models.observation.demonstration import Demonstration
-from ...models.observation.evidence import Imperfection
+from ...models.observation.evidence import AnySensor
 from ...models.process.mdp import TabularMDP
 from .mixture_problem import MixtureProblem, Start, in_threads, mixture_data, pose, resolve_jit, starts
 
@@ -134,9 +134,9 @@ def sweep(
     state = _reseat(seat_key, state, problem, auxiliary)
     state, evaluations = _move_weights(move_key, state, problem, reference, moves)
     if isinstance(problem.concentration, dist.Distribution):
-        ways = jnp.sum(jnp.bincount(state.assignment, length=len(state.assignment)) > 0)
+        n_components = jnp.sum(jnp.bincount(state.assignment, length=len(state.assignment)) > 0)
         moved = move_concentration(
-            concentration_key, state.concentration, problem.concentration, ways, len(state.assignment)
+            concentration_key, state.concentration, problem.concentration, n_components, len(state.assignment)
         )
         state = state._replace(concentration=moved)
     return state, evaluations
@@ -252,7 +252,7 @@ def _move_weights(
         *_, (y, column_y, level_y), count = lax.while_loop(lambda c: ~(c[4][2] >= threshold), propose, start)
         return (y, column_y, level_y, members), count
 
-    def one_way(inputs: tuple) -> tuple:
+    def one_component(inputs: tuple) -> tuple:
         key, x, column, members = inputs
 
         def move() -> tuple:
@@ -263,12 +263,16 @@ def _move_weights(
         return lax.cond(jnp.any(members > 0), move, lambda: (x, column, jnp.array(0)))
 
     keys = jax.random.split(key, n)
-    position, table, count = lax.map(one_way, (keys, state.position, state.log_likelihood, members))
+    position, table, count = lax.map(one_component, (keys, state.position, state.log_likelihood, members))
     return state._replace(position=position, log_likelihood=table), jnp.sum(count)
 
 
 def move_concentration(
-    key: Array, concentration: Float[Array, ""], prior: dist.Distribution, ways: Int[Array, ""], n: int
+    key: Array,
+    concentration: Float[Array, ""],
+    prior: dist.Distribution,
+    n_components: Int[Array, ""],
+    n: int,
 ) -> Float[Array, ""]:
     """Metropolis steps of random size on the concentration given the number of ways."""
     transform = dist.biject_to(prior.support)
@@ -276,7 +280,7 @@ def move_concentration(
     def density(z: Float[Array, ""]) -> Float[Array, ""]:
         alpha = transform(z)
         log_prior = prior.log_prob(alpha) + transform.log_abs_det_jacobian(z, alpha)
-        return log_prior + ways * jnp.log(alpha) + gammaln(alpha) - gammaln(alpha + n)
+        return log_prior + n_components * jnp.log(alpha) + gammaln(alpha) - gammaln(alpha + n)
 
     def step(z: Float[Array, ""], key: Array) -> tuple:
         size_key, step_key, accept_key = jax.random.split(key, 3)
@@ -337,7 +341,7 @@ def _break_all(keys: Array, seated: Seated, prior: dist.Distribution, components
 def gibbs_mixture_posterior(
     key: Array,
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     demonstration: Demonstration,
     *,
     components: int = COMPONENTS,

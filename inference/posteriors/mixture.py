@@ -22,7 +22,7 @@ from numpyro.infer import NUTS
 from ...models.inputs.arguments import as_key
 from ...models.laws.mixture import COMPONENTS, stick_proportions
 from ...models.observation.demonstration import Demonstration
-from ...models.observation.evidence import Imperfection
+from ...models.observation.evidence import AnySensor
 from ...models.process.mdp import TabularMDP
 from .chains import Transitions, in_threads, run_nuts
 from .mixture_problem import (
@@ -109,7 +109,7 @@ def _start_position(key: Array, start: Start, problem: MixtureProblem, component
 def sample_mixture_posterior(
     key: Array,
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     demonstration: Demonstration,
     *,
     components: int = COMPONENTS,
@@ -155,8 +155,8 @@ def sample_mixture_posterior(
         ``posterior``: ``weights (chain, draw, component, feature)``, ``proportions (chain, draw,
         component)``, and ``concentration (chain, draw)`` if it is random.
         ``assignments``: ``assignment (chain, draw, trajectory)``, the component of each trajectory in that
-        draw; ``n_ways (chain, draw)``, the number of components that have any, and its posterior
-        ``n_ways_probability (ways)``, 1 to the number of trajectories; ``log_joint (chain, draw)``, see
+        draw; ``n_components (chain, draw)``, the number of components that have any, and its posterior
+        ``n_ways_probability (components)``, 1 to the number of trajectories; ``log_joint (chain, draw)``, see
         :class:`Resolved`; ``co_clustering (trajectory, trajectory_)``, the posterior probability that two
         trajectories were done the same way.
         ``log_likelihood``: ``demonstration (chain, draw, trajectory)``, assignments summed out.

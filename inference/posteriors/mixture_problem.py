@@ -30,7 +30,7 @@ from ...models.laws.mixture import (
 from ...models.laws.occlusion import scaled_prior
 from ...models.observation.demonstration import Demonstration
 from ...models.observation.evidence import (
-    Imperfection,
+    AnySensor,
     checked_demonstration,
     fitting_sensor,
     require_possible,
@@ -49,11 +49,11 @@ _MOST_STARTING_WAYS = 6
 class MixtureProblem(NamedTuple):
     """Arguments of :func:`mixture_model`, trajectories prepared; ``rows`` finds each among them.
 
-    ``prior`` is over one way's weights ``[K]``; ``concentration`` is a number or its prior.
+    ``prior`` is over one component's weights ``[K]``; ``concentration`` is a number or its prior.
     """
 
     mdp: TabularMDP
-    sensor: Imperfection
+    sensor: AnySensor
     perceived: Perceived
     rows: Int[Array, " n"]
     prior: dist.Distribution
@@ -116,14 +116,14 @@ def resolve(
         policies = soft_policies(problem.mdp, weights)
         table = component_log_likelihoods(problem.mdp, policies, problem.perceived)[:, rows]
         joint = safe_log(proportions)[:, None] + table
-        ways = jax.random.categorical(key, joint, axis=0) if given is None else given
-        counts = jnp.bincount(ways, length=len(weights))
+        components = jax.random.categorical(key, joint, axis=0) if given is None else given
+        counts = jnp.bincount(components, length=len(weights))
         prior = jnp.where(counts > 0, problem.prior.log_prob(weights), 0.0)
         log_joint = log_partition(counts, concentration) + jnp.sum(prior)
         if isinstance(problem.concentration, dist.Distribution):
             log_joint += problem.concentration.log_prob(concentration)
-        log_joint += jnp.sum(table[ways, jnp.arange(len(rows))])
-        return Resolved(ways.astype(jnp.int32), jax.nn.logsumexp(joint, axis=0), log_joint)
+        log_joint += jnp.sum(table[components, jnp.arange(len(rows))])
+        return Resolved(components.astype(jnp.int32), jax.nn.logsumexp(joint, axis=0), log_joint)
 
     return lax.map(one, (keys, weights, proportions, concentration, assignment))
 
@@ -152,10 +152,12 @@ def _mean_features(problem: MixtureProblem) -> Float[Array, "n K"]:
     return (jnp.einsum("usa,sak->uk", counts, mdp.features) / steps[:, None])[problem.rows]
 
 
-def _k_means(rng: np.random.Generator, points: Float[np.ndarray, "n K"], ways: int) -> Int[np.ndarray, " n"]:
+def _k_means(
+    rng: np.random.Generator, points: Float[np.ndarray, "n K"], components: int
+) -> Int[np.ndarray, " n"]:
     """Lloyd's algorithm from centres spread at random (k-means++); clusters may stay empty."""
     centres = points[rng.integers(len(points), size=1)]
-    while len(centres) < ways:
+    while len(centres) < components:
         distance = ((points[:, None] - centres) ** 2).sum(-1).min(1) + 1e-12
         centres = np.vstack([centres, points[rng.choice(len(points), p=distance / distance.sum())]])
     for _ in range(20):
@@ -173,12 +175,12 @@ def starts(key: Array, problem: MixtureProblem, chains: int, most: int) -> list[
     points = points / np.maximum(points.std(0), 1e-12)
     most = min(most, _MOST_STARTING_WAYS, len(points))
     # One way's density knows neither the concentration nor how many trajectories there are.
-    one_way = problem._replace(concentration=jnp.ones(()), rows=problem.rows[:0])
+    one_component = problem._replace(concentration=jnp.ones(()), rows=problem.rows[:0])
     rows, size = np.asarray(problem.rows), len(problem.perceived.repeats)
 
     def climb(members: Int[np.ndarray, " i"]) -> Float[np.ndarray, " D"]:
         repeats = jnp.asarray(np.bincount(rows[members], minlength=size))
-        chosen = one_way._replace(perceived=problem.perceived._replace(repeats=repeats))
+        chosen = one_component._replace(perceived=problem.perceived._replace(repeats=repeats))
 
         def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
             value, slope = _potential_and_gradient({"weights": x[None]}, chosen)
@@ -202,7 +204,7 @@ def starts(key: Array, problem: MixtureProblem, chains: int, most: int) -> list[
 
 def pose(
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     demonstration: Demonstration,
     *,
     concentration: float | dist.Distribution,
@@ -288,12 +290,15 @@ def mixture_data(
     group = xr.Dataset(
         {
             "assignment": (tuple(grid), assignment.reshape(chains, draws, n)),
-            "n_ways": (("chain", "draw"), occupied.reshape(chains, draws)),
+            "n_components": (("chain", "draw"), occupied.reshape(chains, draws)),
             "log_joint": (("chain", "draw"), np.asarray(resolved.log_joint).reshape(chains, draws)),
-            "n_ways_probability": ("ways", np.bincount(occupied, minlength=n + 1)[1:] / len(assignment)),
+            "n_ways_probability": (
+                "components",
+                np.bincount(occupied, minlength=n + 1)[1:] / len(assignment),
+            ),
             "co_clustering": (("trajectory", "trajectory_"), shared / len(assignment)),
         },
-        coords=grid | {"trajectory_": grid["trajectory"].values, "ways": np.arange(1, n + 1)},
+        coords=grid | {"trajectory_": grid["trajectory"].values, "components": np.arange(1, n + 1)},
         attrs=attrs,
     )
     idata.add_groups({"assignments": group})
@@ -303,17 +308,17 @@ def mixture_data(
 def label_invariant(idata: az.InferenceData) -> xr.Dataset:
     """Quantities of a mixture's posterior that do not depend on what the components are called.
 
-    For ``az.rhat``, ``az.ess``, ``az.summary`` and ``az.plot_trace``: ``n_ways``, ``log_joint`` and
+    For ``az.rhat``, ``az.ess``, ``az.summary`` and ``az.plot_trace``: ``n_components``, ``log_joint`` and
     ``log_likelihood (chain, draw)``, ``proportion (chain, draw, rank)`` from the largest down,
     ``trajectory_weights (chain, draw, trajectory, feature)``, the weights that each trajectory was done with,
-    and ``concentration`` if it is random. (R-hat of a quantity that never varies, such as ``n_ways`` where it
-    is certain, is NaN.)
+    and ``concentration`` if it is random. (R-hat of a quantity that never varies, such as ``n_components``
+    where it is certain, is NaN.)
     """
     posterior, group = idata["posterior"], idata["assignments"]
     descending = -np.sort(-posterior.proportions.values, axis=-1)
     invariant = xr.Dataset(
         {
-            "n_ways": group.n_ways,
+            "n_components": group.n_components,
             "log_joint": group.log_joint,
             "log_likelihood": idata["log_likelihood"].demonstration.sum("trajectory"),
             "proportion": (("chain", "draw", "rank"), descending),

@@ -25,8 +25,8 @@ from ...models.laws.noisy_behaviour import noisy_behaviour_model, reliabilities_
 from ...models.laws.trajectory import TrajectoryLaw
 from ...models.observation.demonstration import Demonstration
 from ...models.observation.evidence import (
+    AnySensor,
     FeatureNoise,
-    Imperfection,
     Sensor,
     checked_demonstration,
     require_possible,
@@ -189,7 +189,7 @@ def noisy_problem(
     predicates: ArrayLike,
     demonstration: Demonstration,
     *,
-    view: Imperfection | None = None,
+    view: AnySensor | None = None,
     reportable: ArrayLike | None = None,
     prior: dist.Distribution | None = None,
     reliability_prior: dist.Distribution | None = None,
@@ -225,7 +225,7 @@ def sample_noisy_posterior(
     predicates: ArrayLike,
     demonstration: Demonstration,
     *,
-    view: Imperfection | None = None,
+    view: AnySensor | None = None,
     reportable: ArrayLike | None = None,
     prior: dist.Distribution | None = None,
     reliability_prior: dist.Distribution | None = None,

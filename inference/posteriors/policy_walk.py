@@ -70,14 +70,14 @@ def _walk(
     mdp: TabularMDP,
     counts: Float[Array, "n S A"],
     prior: dist.Distribution | None,
-    eta: Float[Array, ""],
+    rationality: Float[Array, ""],
     step: Float[Array, ""],
     chains: int,
     warmup: int,
     draws: int,
 ) -> Walk:
     def evaluate(weights: Float[Array, " K"]) -> tuple:
-        each = count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, eta), counts)
+        each = count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, rationality), counts)
         if prior is None:
             return each, jnp.sum(each)
         # Densities are asked for inside their support only: outside, many return a number all the same.
@@ -127,7 +127,7 @@ def birl(
     mdp: TabularMDP,
     demonstration: Demonstration,
     *,
-    eta: float = ETA,
+    rationality: float = ETA,
     prior: dist.Distribution | None = None,
     draws: int = 2000,
     warmup: int = 1000,
@@ -143,7 +143,7 @@ def birl(
     key : JAX random key
     mdp, demonstration
         The decision process; its demonstration, every step seen.
-    eta : float
+    rationality : float
         Inverse temperature of the expert, per unit of value.
     prior : numpyro.distributions.Distribution, optional
         Over ``K`` scaled weights, or over one and taken for each; what it puts outside the box is cut off.
@@ -170,7 +170,7 @@ def birl(
         undiscounted MDP.
     """
     require_discounted(mdp)
-    require_positive(eta=eta, draws=draws, chains=chains, step=step)
+    require_positive(rationality=rationality, draws=draws, chains=chains, step=step)
     if warmup < 0:
         raise ValueError(f"warmup must be at least 0, got {warmup}")
     counts = visit_counts(mdp, demonstration)
@@ -178,8 +178,8 @@ def birl(
     walk: Walk = jax.tree.map(
         np.asarray,
         _walk(
-            as_key(key), with_scaled_features(mdp), jnp.asarray(counts), prior, jnp.asarray(float(eta)),
-            jnp.asarray(float(step)), chains, warmup, draws,
+            as_key(key), with_scaled_features(mdp), jnp.asarray(counts), prior,
+            jnp.asarray(float(rationality)), jnp.asarray(float(step)), chains, warmup, draws,
         ),
     )  # fmt: skip
     if prior is not None and not np.isfinite(walk.lp[:, -1]).all():
@@ -188,7 +188,7 @@ def birl(
         "inference_library": "i2rl",
         "i2rl_version": __version__,
         "inference": "random-walk Metropolis-Hastings over scaled weights in [-1, 1], Boltzmann likelihood",
-        "eta": float(eta),
+        "rationality": float(rationality),
         "mdp_fingerprint": mdp.fingerprint(),
         "prior": "Uniform(-1, 1)" if prior is None else f"{described_prior(prior)} on [-1, 1]",
         "key": str(np.asarray(jax.random.key_data(key)).tolist()),

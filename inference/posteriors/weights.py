@@ -28,7 +28,7 @@ from ...models.laws.chain import filter_all, sample_backward
 from ...models.laws.occlusion import ScaledPrior, occlusion_model, scaled_prior
 from ...models.observation.demonstration import PAD, UNKNOWN, Demonstration
 from ...models.observation.evidence import (
-    Imperfection,
+    AnySensor,
     checked_demonstration,
     fitting_sensor,
     require_possible,
@@ -44,7 +44,7 @@ class Problem(NamedTuple):
     """Arguments of :func:`occlusion_model`, identical trajectories gathered."""
 
     mdp: TabularMDP
-    sensor: Imperfection
+    sensor: AnySensor
     codes: Int[Array, "u L 3"]
     repeats: Int[Array, " u"]
     prior: dist.Distribution
@@ -164,7 +164,7 @@ def posterior_mode(problem: Problem) -> Mode:
 
 def gather(
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     demonstration: Demonstration,
     prior: dist.Distribution | None = None,
 ) -> tuple[Problem, Int[np.ndarray, " n"]]:
@@ -190,7 +190,7 @@ def gather(
 def sample_posterior(
     key: Array,
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     demonstration: Demonstration,
     *,
     prior: dist.Distribution | None = None,

@@ -454,15 +454,15 @@ def exponentiated_gradient(
     mdp: TabularMDP,
     target: FeatureTarget,
     epsilon: ArrayLike = 0.01,
-    rate: float | None = None,
+    learning_rate: float | None = None,
     start: Float[Array, " K"] | None = None,
     max_steps: int = 10_000,
 ) -> Solution:
     """Normalised exponentiated gradient on the simplex, lines 12-18 of Algorithm 1.
 
-    ``theta_k <- theta_k exp(rate z_k) / sum_j theta_j exp(rate z_j)`` with ``z = phi_hat - E[phi]``, until
-    ``max_k |z_k| <= epsilon / (1 - gamma)``. Two deviations: line 16 prints ``exp(-eta z)``, which with the
-    ``z`` of line 15 descends the likelihood (the dissertation's code has ``exp(-2c (E[phi] - phi_hat))``,
+    ``theta_k <- theta_k exp(learning_rate z_k) / sum_j theta_j exp(rate z_j)`` with ``z = phi_hat - E[phi]``,
+    until ``max_k |z_k| <= epsilon / (1 - gamma)``. Two deviations: line 16 prints ``exp(-eta z)``, which with
+    the ``z`` of line 15 descends the likelihood (the dissertation's code has ``exp(-2c (E[phi] - phi_hat))``,
     the sign used here); and ``E[phi]`` of line 14 is exact, not an average of sampled trajectories.
 
     Scaled weights stay positive and sum to one. The solver therefore cannot express a negative weight, nor
@@ -476,7 +476,7 @@ def exponentiated_gradient(
         As for :func:`solve_dual`.
     epsilon : float
         Tolerance per step, ``epsilon`` of Theorem 1, in units of each feature's scale.
-    rate : float or None
+    learning_rate : float or None
         ``eta``, per unit of discounted scaled features; ``(1 - gamma) / 4`` by default.
     start : float ``[K]`` or None
         Weights of the previous session, all positive; equal scaled weights by default. Normalised before use.
@@ -494,7 +494,9 @@ def exponentiated_gradient(
     scale = feature_scale(mdp)
     scaled = FeatureTarget(features / scale, initial)
     weights = None if start is None else jnp.asarray(start, float) * scale
-    solution = exponentiate_scaled(with_scaled_features(mdp), scaled, epsilon, rate, weights, max_steps)
+    solution = exponentiate_scaled(
+        with_scaled_features(mdp), scaled, epsilon, learning_rate, weights, max_steps
+    )
     return _unscaled(solution, scale)
 
 
@@ -502,7 +504,7 @@ def exponentiate_scaled(
     mdp: TabularMDP,
     target: FeatureTarget,
     epsilon: ArrayLike = 0.01,
-    rate: float | None = None,
+    learning_rate: float | None = None,
     start: Float[Array, " K"] | None = None,
     max_steps: int = 10_000,
 ) -> Solution:
@@ -512,7 +514,7 @@ def exponentiate_scaled(
         raise ValueError(
             f"the exponentiated gradient needs positive starting weights, got {np.asarray(weights)}"
         )
-    step = (1 - mdp.discount) / 4 if rate is None else jnp.asarray(rate, float)
+    step = (1 - mdp.discount) / 4 if learning_rate is None else jnp.asarray(learning_rate, float)
     return _exponentiated_gradient(mdp, target, epsilon, step, weights, max_steps)
 
 
@@ -521,7 +523,7 @@ def _exponentiated_gradient(
     mdp: TabularMDP,
     target: FeatureTarget,
     epsilon: Float[Array, ""],
-    rate: Float[Array, ""],
+    learning_rate: Float[Array, ""],
     weights: Float[Array, " K"],
     max_steps: Int[Array, ""],
 ) -> Solution:
@@ -532,7 +534,7 @@ def _exponentiated_gradient(
 
     def step(carry: tuple) -> tuple:
         (weights, values, gap), steps = carry
-        return visit(jax.nn.softmax(jnp.log(weights) + rate * gap), values), steps + 1
+        return visit(jax.nn.softmax(jnp.log(weights) + learning_rate * gap), values), steps + 1
 
     def unfinished(carry: tuple) -> Bool[Array, ""]:
         (_, _, gap), steps = carry

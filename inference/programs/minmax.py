@@ -12,7 +12,7 @@ that the stationary points are those of::
                 sum_d v_id = 1,  sum_d pi_d = 1,  v >= 0,  pi >= 0
 
 (the sums over ``s, a`` of trajectory ``i`` are ``theta_d.F_i - W_i.V_d``: only those are ever formed). Given
-the rest, and at ``price`` 1, the best ``v`` are the posterior probabilities of the ways, at which the
+the rest, and at ``temperature`` 1, the best ``v`` are the posterior probabilities of the ways, at which the
 maximised function is the marginal likelihood of the mixture; :mod:`~i2rl.inference.mixtures.fit` says why to
 pay less. Alternating between them, the proportions and the rewards ascends the same function; from the same
 start both mostly, but not always, end on the same of its hills. ``N_i`` is conditional on where a trajectory
@@ -100,7 +100,7 @@ class MinMaxSolution(NamedTuple):
     proportions : float ``[D]``
         ``pi_d``; a component that died has one close to zero.
     responsibilities : float ``[n, D]``
-        ``v_{d,i}``; at ``price`` 1 the posterior probabilities of the ways. Rows sum to one.
+        ``v_{d,i}``; at ``temperature`` 1 the posterior probabilities of the ways. Rows sum to one.
     objective : float
         The maximised objective, penalties included (nats).
     iterations : int
@@ -127,8 +127,8 @@ class _Statistics(NamedTuple):
 
 class _Penalties(NamedTuple):
     strength: float
-    price: float
-    l1: Float[np.ndarray, " K"]
+    temperature: float
+    slack: Float[np.ndarray, " K"]
     ridge: float
 
 
@@ -157,26 +157,32 @@ class MinMaxProgram:
         features = [ca.SX.sym(f"F{d}", trajectories, n_features) for d in range(components)]
         state_weights = [ca.SX.sym(f"W{d}", trajectories, n_states) for d in range(components)]
         counted = ca.SX.sym("counted", trajectories)
-        strength, price = ca.SX.sym("strength"), ca.SX.sym("price")
-        l1, ridge = ca.SX.sym("l1", n_features), ca.SX.sym("ridge")
+        strength, temperature = ca.SX.sym("strength"), ca.SX.sym("temperature")
+        slack, ridge = ca.SX.sym("slack", n_features), ca.SX.sym("ridge")
         theta = parts[:n_features, :] - parts[n_features:, :]
         phi = ca.sparsify(ca.DM(self._flow.features))
         advantage = phi @ theta - ca.DM(sparse.csc_matrix(self._flow.balance)).T @ values
         likelihoods = ca.horzcat(
             *[features[d] @ theta[:, d] - state_weights[d] @ values[:, d] for d in range(components)]
         )
-        fit = v * (likelihoods + price * (ca.repmat(ca.log(pi).T, trajectories, 1) - ca.log(v)))
+        fit = v * (likelihoods + temperature * (ca.repmat(ca.log(pi).T, trajectories, 1) - ca.log(v)))
         objective = (
             ca.dot(counted, ca.sum2(fit))
-            + price * strength * ca.dot(pi, ca.log(pi))
-            - ca.dot(l1, ca.sum2(parts[:n_features, :] + parts[n_features:, :]))
+            + temperature * strength * ca.dot(pi, ca.log(pi))
+            - ca.dot(slack, ca.sum2(parts[:n_features, :] + parts[n_features:, :]))
             - ridge / 2 * ca.dot(theta, theta)
         )
         maxima = [soft_maximum(advantage[:, d], self._flow.row) for d in range(components)]
         program = {
             "x": ca.vertcat(ca.vec(v), pi, ca.vec(parts), ca.vec(values)),
             "p": ca.vertcat(
-                *map(ca.vec, features), *map(ca.vec, state_weights), counted, strength, price, l1, ridge
+                *map(ca.vec, features),
+                *map(ca.vec, state_weights),
+                counted,
+                strength,
+                temperature,
+                slack,
+                ridge,
             ),
             "f": -objective,
             "g": ca.vertcat(ca.sum2(v), ca.sum1(pi), *maxima),
@@ -188,10 +194,10 @@ class MinMaxProgram:
         self,
         counts: ArrayLike,
         strength: float = 1.0,
-        l1: ArrayLike = 0.0,
+        slack: ArrayLike = 0.0,
         ridge: float = 0.0,
         *,
-        price: float = 1.0,
+        temperature: float = 1.0,
         responsibilities: ArrayLike | None = None,
         weights: ArrayLike | None = None,
         warm: MinMaxPoint | None = None,
@@ -205,10 +211,10 @@ class MinMaxProgram:
             where steps are hidden.
         strength : float
             ``lambda`` of the entropic prior on the proportions.
-        l1, ridge : float or ``[K]``, float
+        slack, ridge : float or ``[K]``, float
             Penalties of each component's scaled weights (:mod:`~i2rl.models.process.units`), in nats in all
             (a Laplace and a Gaussian prior).
-        price : float
+        temperature : float
             What a nat of information of who did what costs, in nats of likelihood; more than zero.
         responsibilities : float ``[n, D]``
             Start: who did what; each component begins at the best weights for its share.
@@ -227,7 +233,7 @@ class MinMaxProgram:
             When IPOPT gives up.
         """
         statistics = self._statistics(counts)
-        penalties = self._penalties(strength, price, l1, ridge)
+        penalties = self._penalties(strength, temperature, slack, ridge)
         given = {"responsibilities": responsibilities, "weights": weights, "warm": warm}
         named = [name for name, start in given.items() if start is not None]
         if len(named) != 1:
@@ -289,19 +295,19 @@ class MinMaxProgram:
         by_pair = np.broadcast_to(by_pair, (self.components, n, by_pair.shape[-1]))
         return _Statistics(by_pair @ self._flow.features, by_pair @ self._flow.balance.T.toarray())
 
-    def _penalties(self, strength: float, price: float, l1: ArrayLike, ridge: float) -> _Penalties:
-        slack = np.asarray(l1, float)
+    def _penalties(self, strength: float, temperature: float, slack: ArrayLike, ridge: float) -> _Penalties:
+        slack = np.asarray(slack, float)
         if slack.shape not in ((), (self.mdp.n_features,)):
             raise ValueError(
                 f"l1 must be a number or have shape [K] = [{self.mdp.n_features}], got {list(slack.shape)}"
             )
-        for name, value in (("strength", strength), ("l1", slack), ("ridge", ridge)):
+        for name, value in (("strength", strength), ("slack", slack), ("ridge", ridge)):
             if not (np.isfinite(value) & (np.asarray(value) >= 0)).all():
                 raise ValueError(f"{name} must be finite and not negative, got {value}")
-        if not (np.isfinite(price) and price > 0):
-            raise ValueError(f"price must be finite and more than zero, got {price}")
+        if not (np.isfinite(temperature) and temperature > 0):
+            raise ValueError(f"price must be finite and more than zero, got {temperature}")
         return _Penalties(
-            float(strength), float(price), np.broadcast_to(slack, (self.mdp.n_features,)), float(ridge)
+            float(strength), float(temperature), np.broadcast_to(slack, (self.mdp.n_features,)), float(ridge)
         )
 
     @staticmethod
@@ -336,12 +342,12 @@ class MinMaxProgram:
                 f"rows of responsibilities must be distributions: least {shares.min()}, sums from "
                 f"{shares.sum(1).min()} to {shares.sum(1).max()}"
             )
-        strength, _, l1, ridge = penalties
+        strength, _, slack, ridge = penalties
         visits = np.broadcast_to(visits, (self.components, *visits.shape[-3:]))
         origin = WarmStart(jnp.zeros(self.mdp.n_features), jnp.zeros(self.mdp.n_states))
         fits = [
             fit_scaled_counts(
-                self._scaled, jnp.asarray(np.tensordot(shares[:, d], visits[d], 1)), l1, ridge, origin
+                self._scaled, jnp.asarray(np.tensordot(shares[:, d], visits[d], 1)), slack, ridge, origin
             )
             for d in range(self.components)
         ]
@@ -361,7 +367,7 @@ class MinMaxProgram:
         solver: ca.Function,
     ) -> tuple[MinMaxSolution, str]:
         """Solve from a start; status '' means solved."""
-        strength, price, l1, ridge = penalties
+        strength, temperature, slack, ridge = penalties
         (n_components, n, n_features), n_states = statistics.features.shape, self.mdp.n_states
         spare = self.trajectories - n
         absent = np.arange(self.trajectories) >= n
@@ -369,14 +375,14 @@ class MinMaxProgram:
         # Proportions and responsibilities of exactly zero have no logarithm.
         pi = np.maximum(start.proportions, _WARM_BARRIER)
         pi = pi / pi.sum()
-        posterior, evidence = _posterior(statistics, start.parts, start.values, pi, price)
+        posterior, evidence = _posterior(statistics, start.parts, start.values, pi, temperature)
         v = np.full((self.trajectories, n_components), 1 / n_components)
         v[:n] = np.maximum(posterior, _WARM_BARRIER / 10)
         v /= v.sum(1, keepdims=True)
         # Rows without a trajectory are held where they are. Without l1, plus and minus could grow together
         # for nothing: plus alone is then the weight.
         held = np.broadcast_to(absent[:, None], v.shape)
-        free = np.tile(l1 == 0, (n_components, 1))
+        free = np.tile(slack == 0, (n_components, 1))
         zero, infinite = np.zeros_like(free, float), np.full(free.shape, np.inf)
         unbounded = np.full((n_components, n_states), np.inf)
         lower = _flat(
@@ -391,7 +397,7 @@ class MinMaxProgram:
         loose = np.append(absent, False)
         # Stationarity in v gives the multipliers of its rows; interior v have none but the barrier's.
         rows = np.zeros(self.trajectories)
-        rows[:n] = evidence - price
+        rows[:n] = evidence - temperature
         parts = start.parts
         if free.any():
             joined = np.concatenate([parts[:, :n_features] - parts[:, n_features:], zero], axis=1)
@@ -403,9 +409,8 @@ class MinMaxProgram:
                 start.part_multipliers.T, np.zeros_like(start.values.T),
             ),
             lam_g0=_flat(rows, np.array([start.sum_multiplier]), start.bellman_multipliers.T),
-            p=_flat(*(part for table in padded for part in table), ~absent, [strength], [price], l1, [ridge]),
-            lbx=lower, ubx=upper,
-            lbg=np.concatenate([np.where(loose, -np.inf, sums), bellman]),
+            p=_flat(*(part for table in padded for part in table), ~absent, [strength], [temperature], slack,
+            [ridge]), lbx=lower, ubx=upper, lbg=np.concatenate([np.where(loose, -np.inf, sums), bellman]),
             ubg=np.concatenate([np.where(loose, np.inf, sums), bellman]),
         )  # fmt: skip
         outcome = solver.stats()
@@ -434,7 +439,7 @@ class MinMaxProgram:
         iterations: int,
         solved: bool,
     ) -> MinMaxSolution:
-        strength, price, l1, ridge = penalties
+        strength, temperature, slack, ridge = penalties
         plus, minus = np.split(point.parts, 2, axis=1)
         weights, values = plus - minus, point.values
         if solved:
@@ -446,10 +451,10 @@ class MinMaxProgram:
             )
         pi = np.maximum(point.proportions, 0.0)
         pi = pi / pi.sum()
-        posterior, evidence = _posterior(statistics, point.parts, values, pi, price)
+        posterior, evidence = _posterior(statistics, point.parts, values, pi, temperature)
         objective = (
-            evidence.sum() + price * strength * xlogy(pi, pi).sum()
-            - (np.abs(weights) @ l1).sum() - ridge / 2 * (weights**2).sum()
+            evidence.sum() + temperature * strength * xlogy(pi, pi).sum()
+            - (np.abs(weights) @ slack).sum() - ridge / 2 * (weights**2).sum()
         )  # fmt: skip
         return MinMaxSolution(
             weights / self._scale, values, pi, posterior, float(objective), iterations, point
@@ -457,16 +462,20 @@ class MinMaxProgram:
 
 
 def _posterior(
-    statistics: _Statistics, parts: np.ndarray, values: np.ndarray, proportions: np.ndarray, price: float
+    statistics: _Statistics,
+    parts: np.ndarray,
+    values: np.ndarray,
+    proportions: np.ndarray,
+    temperature: float,
 ) -> tuple[Float[np.ndarray, "n D"], Float[np.ndarray, " n"]]:
     """The best responsibilities, and what each trajectory then adds to the objective."""
     plus, minus = np.split(parts, 2, axis=1)
     likelihood = np.einsum("dik,dk->id", statistics.features, plus - minus)
     likelihood -= np.einsum("dis,ds->id", statistics.state_weights, values)
     with np.errstate(divide="ignore"):
-        joint = np.log(proportions) + likelihood / price
+        joint = np.log(proportions) + likelihood / temperature
     evidence = logsumexp(joint, axis=1)
-    return np.exp(joint - evidence[:, None]), price * evidence
+    return np.exp(joint - evidence[:, None]), temperature * evidence
 
 
 def _flat(*parts: Any) -> np.ndarray:

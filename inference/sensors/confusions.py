@@ -15,7 +15,7 @@ class ConfusionNoise(Protocol):
     """Confusions whose probabilities can be learned: ``Confusions``, or ``SwapNoise``."""
 
     @property
-    def noise(self) -> Float[Array, " M"]:
+    def chances(self) -> Float[Array, " M"]:
         """Probability of each, where it acts."""
 
     @property
@@ -23,14 +23,14 @@ class ConfusionNoise(Protocol):
         """Where each has something to confuse."""
 
     @property
-    def reading(self) -> ObservationModel:
+    def noise(self) -> ObservationModel:
         """The observation model."""
 
     def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
         """Which of them turned each truth into its report (flat indices)."""
 
-    def _replace(self, *, noise: Array = ...) -> Any:
-        """Itself with another ``noise``."""
+    def _replace(self, *, chances: Array = ...) -> Any:
+        """Itself with other ``chances``."""
 
 
 class ConfusionStatistic(NamedTuple):
@@ -64,4 +64,4 @@ def fitted_confusions(
     assumed: ConfusionNoise, counts: ConfusionStatistic, trust: float
 ) -> Float[Array, " M"]:
     """The M-step: shares of what happened, the assumed probabilities counting as ``trust`` observations."""
-    return (trust * assumed.noise + counts.happened) / (trust + counts.possible)
+    return (trust * assumed.chances + counts.happened) / (trust + counts.possible)

@@ -256,7 +256,7 @@ def report_log_evidence(
     logits: Float[Array, " J"],
     reports: SessionReports,
     confidence: Float[Array, "... S A"],
-    presence: Float[Array, " S"] | None = None,
+    visibility: Float[Array, " S"] | None = None,
 ) -> Float[Array, "n L S A"]:
     """``log e_t(s, a)`` of every step under these reliabilities.
 
@@ -266,15 +266,15 @@ def report_log_evidence(
     confidence : float ``[S, A]`` or ``[n, L, S, A]``
         Probability that the report is right if the truth is ``(s, a)``; NaN where there are no scores. Of a
         truth that cannot be reported no report is right, whatever is said here.
-    presence : float ``[S]``, optional
+    visibility : float ``[S]``, optional
         Probability of being in view; everything is, by default.
     """
     total = _likelihood(classes, _terms(classes, logits), reports, confidence).total
-    reading = jnp.where(total > 0, jnp.log(jnp.where(total > 0, total, 1.0)), -jnp.inf)
-    view = jnp.ones(classes.of_pair.shape[0]) if presence is None else presence
+    noise = jnp.where(total > 0, jnp.log(jnp.where(total > 0, total, 1.0)), -jnp.inf)
+    view = jnp.ones(classes.of_pair.shape[0]) if visibility is None else visibility
     kind = reports.kind[..., None, None]
     seen, hidden = jnp.log(view)[:, None], jnp.log1p(-view)[:, None]
-    return jnp.where(kind == SEEN, reading + seen, jnp.where(kind == HIDDEN, hidden, 0.0))
+    return jnp.where(kind == SEEN, noise + seen, jnp.where(kind == HIDDEN, hidden, 0.0))
 
 
 # -- the statistic ------------------------------------------------------------------------------------

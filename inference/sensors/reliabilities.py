@@ -140,7 +140,7 @@ def entropic_perception(
     scores: str,
     truths: str,
     errors: float,
-    memory: float,
+    forgetting: float,
     program: ObservationProgram | None = None,
 ) -> Perception:
     """The observation program, fed by a posterior over truths, by reports taken for truths, or by truths."""
@@ -188,7 +188,7 @@ def entropic_perception(
         return jnp.where(number > 0, total / jnp.where(number > 0, number, 1.0), jnp.nan)
 
     return Perception(
-        classes, scores != "none", no_reports(classes), partial(blend, memory=memory), summarise, fit,
+        classes, scores != "none", no_reports(classes), partial(blend, forgetting=forgetting), summarise, fit,
         partial(agreement_of, classes), confidence, None if program is None else fit_outside,
     )  # fmt: skip
 

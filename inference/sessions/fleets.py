@@ -14,14 +14,14 @@ from jaxtyping import Array
 
 from ...models.inputs.arguments import as_key
 from ...models.observation.demonstration import Demonstration
-from .learner import Learner, Report
+from .learner import Learner, SessionInfo
 
 
 class Fleet(NamedTuple):
     """One learner on many independent streams: states and demonstrations with a leading axis."""
 
     init: Callable[[Array, int], Any]
-    update: Callable[[Any, Demonstration], tuple[Any, Report]]
+    update: Callable[[Any, Demonstration], tuple[Any, SessionInfo]]
 
 
 def fleet(learner: Learner) -> Fleet:
@@ -40,7 +40,7 @@ def fleet(learner: Learner) -> Fleet:
     session = learner.session
 
     @jax.jit
-    def update(states: Any, demonstrations: Demonstration) -> tuple[Any, Report]:
+    def update(states: Any, demonstrations: Demonstration) -> tuple[Any, SessionInfo]:
         return lax.platform_dependent(
             states,
             jax.tree.map(jnp.asarray, demonstrations),
@@ -56,12 +56,12 @@ def run_streams(
     learner: Learner,
     key: Array,
     demonstrations: Demonstration,
-    keep: Callable[[Any, Report], Any] | None = None,
+    keep: Callable[[Any, SessionInfo], Any] | None = None,
 ) -> tuple[Any, Any]:
     """Run a learner over whole streams in one compiled program, for studies of many repetitions.
 
     ``demonstrations`` holds arrays ``[R, T, n, L]``: ``R`` streams of ``T`` sessions. Returns the final
-    states ``[R]`` and what ``keep(state, report)``, a pure function called after each session (the report
+    states ``[R]`` and what ``keep(state, info)``, a pure function called after each session (the report
     by default), gave: arrays ``[R, T]``. Streams run one after the other. Observations are not checked,
     as in a fleet; of the keys, stream ``i`` gets that which stream ``i`` of a fleet gets.
     Raises ``ValueError`` for a learner whose solver runs outside JAX, or arrays of another rank.
@@ -75,8 +75,8 @@ def run_streams(
 
     def one(inputs: tuple) -> Any:
         def step(state: Any, demonstration: Demonstration) -> tuple:
-            state, report = session(state, demonstration)
-            return state, report if keep is None else keep(state, report)
+            state, info = session(state, demonstration)
+            return state, info if keep is None else keep(state, info)
 
         start, stream = inputs
         return lax.scan(step, init(start), stream)

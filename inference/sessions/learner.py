@@ -20,10 +20,10 @@ from jaxtyping import Array, Float
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
 
-AnyReport = TypeVar("AnyReport", bound=tuple)
+AnyInfo = TypeVar("AnyInfo", bound=tuple)
 
 
-class Report(NamedTuple):
+class SessionInfo(NamedTuple):
     """What a session did: plain numbers (from a fleet, arrays with one entry a stream).
 
     Fields
@@ -63,16 +63,16 @@ class Report(NamedTuple):
     seconds: float
     weights: Float[np.ndarray, " K"]
 
-    def in_plain_numbers(self, seconds: float) -> Report:
+    def in_plain_numbers(self, seconds: float) -> SessionInfo:
         """The report of a compiled session with Python's numbers and NumPy's arrays, and the time it took."""
         return in_plain_numbers(self, seconds)
 
 
-def in_plain_numbers(report: AnyReport, seconds: float) -> AnyReport:
+def in_plain_numbers(info: AnyInfo, seconds: float) -> AnyInfo:
     """A learner's own kind of report in the same form: any named tuple with a field ``seconds``."""
-    arrays = {name: np.asarray(value) for name, value in report._asdict().items()}  # type: ignore[attr-defined]
+    arrays = {name: np.asarray(value) for name, value in info._asdict().items()}  # type: ignore[attr-defined]
     values: dict[str, Any] = {name: x if x.ndim else x.item() for name, x in arrays.items()}
-    return type(report)(**values | {"seconds": seconds})
+    return type(info)(**values | {"seconds": seconds})
 
 
 class Learner(NamedTuple):
@@ -86,8 +86,8 @@ class Learner(NamedTuple):
     mdp: TabularMDP
     configuration: Mapping[str, Any]
     init: Callable[[Array], Any]
-    update: Callable[[Any, Demonstration], tuple[Any, Report]]
-    session: Callable[[Any, Demonstration], tuple[Any, Report]] | None = None
+    update: Callable[[Any, Demonstration], tuple[Any, SessionInfo]]
+    session: Callable[[Any, Demonstration], tuple[Any, SessionInfo]] | None = None
     log_likelihood: Callable[[Any, Float[Array, " K"]], float] | None = None
 
     @property

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 
 from ...models.inputs.text import shortened
 from ...models.observation.demonstration import Demonstration
-from .learner import Learner, Report
+from .learner import Learner, SessionInfo
 from .serialization import demonstration_digest
 from .stopping import StoppingCriterion
 
@@ -33,7 +33,7 @@ class SessionStore(Protocol):
     def state(self) -> Any:
         """State after the last session, None before the first."""
 
-    def commit(self, state: Any, report: Any, *, demonstration: bytes) -> None:
+    def commit(self, state: Any, info: Any, *, demonstration: bytes) -> None:
         """Commit a session with the digest of its demonstration."""
 
     def demonstration(self, session: int) -> bytes:
@@ -47,7 +47,7 @@ class Run(NamedTuple):
     """Final state, the sessions' reports, and whether a criterion stopped them."""
 
     state: Any
-    reports: tuple[Report, ...]
+    infos: tuple[SessionInfo, ...]
     stopped: bool
 
 
@@ -59,7 +59,7 @@ def run_sessions(
     state: Any = None,
     stop: StoppingCriterion | None = None,
     journal: SessionStore | None = None,
-    on_session: Callable[[Any, Report], None] | None = None,
+    on_session: Callable[[Any, SessionInfo], None] | None = None,
     whole: bool | None = None,
 ) -> Run:
     """Run one session per demonstration of the stream until it ends or ``stop`` says so (Definition 7).
@@ -107,18 +107,18 @@ def run_sessions(
         if key is None:
             raise ValueError("run_sessions needs a key, a state or a journal to start from")
         state = learner.init(key)
-    reports: list[Report] = []
+    infos: list[SessionInfo] = []
     unlearned = ((one, b"") for one in stream) if journal is None else _unlearned(stream, journal, whole)
     for demonstration, digest in unlearned:
-        state, report = learner.update(state, demonstration)
-        reports.append(report)
+        state, info = learner.update(state, demonstration)
+        infos.append(info)
         if journal is not None:
-            journal.commit(state, report, demonstration=digest)
+            journal.commit(state, info, demonstration=digest)
         if on_session is not None:
-            on_session(state, report)
-        if stop is not None and stop(reports):
-            return Run(state, tuple(reports), True)
-    return Run(state, tuple(reports), False)
+            on_session(state, info)
+        if stop is not None and stop(infos):
+            return Run(state, tuple(infos), True)
+    return Run(state, tuple(infos), False)
 
 
 def _require_stream(stream: Any) -> None:
@@ -173,7 +173,7 @@ def average_regret(
     """Average regret after each session: running mean of the log-likelihood given away.
 
     ``expert`` and ``learned`` are the sessions' log-likelihoods under the true weights and under the
-    learner's (``learner.log_likelihood(state, true_weights)`` and the reports' ``log_likelihood``); leading
+    learner's (``learner.log_likelihood(state, true_weights)`` and the infos' ``log_likelihood``); leading
     axes are streams. The form of chapter 4, ``LL(theta_E | X_i, .) - LL(theta^i | X_i, .)``, whose two sides
     share their data; Definition 8 prints the previous session's estimate on the previous session's data.
     Raises ``ValueError`` if shapes differ.

@@ -60,15 +60,15 @@ def complete(
     )
 
 
-def blend(kept: Any, new: Any, memory: float = 1.0) -> Any:
+def blend(kept: Any, new: Any, forgetting: float = 1.0) -> Any:
     """Running average of two statistics of one type, weighted by their sizes (Eq. 4.2).
 
-    ``memory`` is the exponent of the new one's share. At 1 everything counts alike; below, what was guessed
-    under early weights is slowly forgotten, as stochastic-approximation EM needs it (Cappe and Moulines 2009:
-    between 1/2 and 1).
+    ``forgetting`` is the exponent of the new one's share. At 1 everything counts alike; below, what was
+    guessed under early weights is slowly forgotten, as stochastic-approximation EM needs it (Cappe and
+    Moulines 2009: between 1/2 and 1).
     """
     total = kept.size + new.size
-    share = jnp.where(total > 0, new.size / jnp.where(total > 0, total, 1.0), 0.0) ** memory
+    share = jnp.where(total > 0, new.size / jnp.where(total > 0, total, 1.0), 0.0) ** forgetting
     merged = [(1 - share) * a + share * b for a, b in zip(kept[1:], new[1:], strict=True)]
     return type(kept)(total, *merged)
 

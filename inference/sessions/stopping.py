@@ -13,13 +13,13 @@ from jaxtyping import Array, Float, Int
 
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import deterministic_policy, hard_plan, policy_values, reward_of
-from .learner import Report
+from .learner import SessionInfo
 
 
 class StoppingCriterion(Protocol):
     """Decides from the reports so far whether the sessions should end."""
 
-    def __call__(self, reports: Sequence[Report]) -> bool:
+    def __call__(self, infos: Sequence[SessionInfo]) -> bool:
         """Whether to stop after the last report."""
 
 
@@ -28,11 +28,11 @@ class LikelihoodChange(NamedTuple):
 
     rho: float
 
-    def __call__(self, reports: Sequence[Report]) -> bool:
+    def __call__(self, infos: Sequence[SessionInfo]) -> bool:
         """Whether to stop after the last report."""
-        if len(reports) < 2:
+        if len(infos) < 2:
             return False
-        return abs(reports[-1].log_likelihood - reports[-2].log_likelihood) <= self.rho
+        return abs(infos[-1].log_likelihood - infos[-2].log_likelihood) <= self.rho
 
 
 class LearningErrorChange:
@@ -52,18 +52,18 @@ class LearningErrorChange:
 
         self._error = jax.jit(error)
 
-    def __call__(self, reports: Sequence[Report]) -> bool:
+    def __call__(self, infos: Sequence[SessionInfo]) -> bool:
         """Whether to stop after the last report."""
-        if len(reports) < 2:
+        if len(infos) < 2:
             return False
-        before, after = (float(self._error(_one_reward(r))) for r in reports[-2:])
+        before, after = (float(self._error(_one_reward(r))) for r in infos[-2:])
         return before - after <= self.rho
 
 
 class MovingWindow:
     """Against early stopping (chapter 4): the standard deviation over the last ``width`` sessions is small.
 
-    ``of`` is the field of the report that must settle within ``tolerance``: ``log_likelihood`` or
+    ``of`` is the field of the info that must settle within ``tolerance``: ``log_likelihood`` or
     ``gradient``. What protects is the width: where nothing is seen everything stands still, so it should
     exceed the longest stretch of sessions without a sighting. Raises ``ValueError`` for another field or a
     width below 2.
@@ -76,11 +76,11 @@ class MovingWindow:
             raise ValueError(f"a moving window needs at least 2 sessions, got {width}")
         self.width, self.tolerance, self.of = width, tolerance, of
 
-    def __call__(self, reports: Sequence[Report]) -> bool:
+    def __call__(self, infos: Sequence[SessionInfo]) -> bool:
         """Whether to stop after the last report."""
-        if len(reports) < self.width:
+        if len(infos) < self.width:
             return False
-        return float(np.std([getattr(r, self.of) for r in reports[-self.width :]])) <= self.tolerance
+        return float(np.std([getattr(r, self.of) for r in infos[-self.width :]])) <= self.tolerance
 
 
 class PolicyWindow:
@@ -106,16 +106,16 @@ class PolicyWindow:
 
         self._actions = jax.jit(actions)
 
-    def __call__(self, reports: Sequence[Report]) -> bool:
+    def __call__(self, infos: Sequence[SessionInfo]) -> bool:
         """Whether to stop after the last report."""
-        if len(reports) < self.width:
+        if len(infos) < self.width:
             return False
-        actions = np.asarray(self._actions(np.stack([_one_reward(r) for r in reports[-self.width :]])))
+        actions = np.asarray(self._actions(np.stack([_one_reward(r) for r in infos[-self.width :]])))
         return float((actions != actions[-1]).mean(axis=1).max()) <= self.tolerance
 
 
-def _one_reward(report: Report) -> Float[np.ndarray, " K"]:
-    weights = np.asarray(report.weights)
+def _one_reward(info: SessionInfo) -> Float[np.ndarray, " K"]:
+    weights = np.asarray(info.weights)
     if weights.ndim != 1:
         raise ValueError(
             f"this criterion compares one reward with the next; the learner has {len(weights)} at a time: "

@@ -22,7 +22,7 @@ from numpyro.distributions.util import validate_sample
 from ..inputs.arguments import as_key
 from ..observation.demonstration import PAD, SEEN, UNKNOWN
 from ..observation.evidence import (
-    Imperfection,
+    AnySensor,
     checked_codes,
     fitting_sensor,
     observe,
@@ -61,7 +61,7 @@ class Perceived(NamedTuple):
     repeats: Int[Array, " u"]
 
 
-def as_evidence(mdp: TabularMDP, sensor: Imperfection, codes: Int[Array, "n L 3"]) -> Perceived:
+def as_evidence(mdp: TabularMDP, sensor: AnySensor, codes: Int[Array, "n L 3"]) -> Perceived:
     """Every trajectory as one that takes a forward pass; traceable."""
     shape = (mdp.n_states, mdp.n_actions)
 
@@ -78,7 +78,7 @@ _as_evidence = jax.jit(as_evidence)
 
 
 def perceive(
-    mdp: TabularMDP, sensor: Imperfection, codes: Int[np.ndarray, "n L 3"]
+    mdp: TabularMDP, sensor: AnySensor, codes: Int[np.ndarray, "n L 3"]
 ) -> tuple[Perceived, Int[np.ndarray, " n"]]:
     """Gather identical trajectories and tell fully seen ones from others; and each trajectory's row.
 
@@ -92,7 +92,7 @@ def perceive(
     distinct = distinct.reshape(-1, *codes.shape[1:])
     kind, state, action = np.moveaxis(distinct, -1, 0)
     clear = ((kind == PAD) | ((kind == SEEN) & (state != UNKNOWN) & (action != UNKNOWN))).all(axis=1)
-    if sensor.reading is not None:
+    if sensor.noise is not None:
         clear[:] = False
     blank = np.broadcast_to(np.array([PAD, UNKNOWN, UNKNOWN]), (1, *codes.shape[1:]))
     parts, places, numbers, start = [], np.zeros(len(distinct), int), [], 0
@@ -201,7 +201,7 @@ class MixtureLaw(dist.Distribution):
         mdp: TabularMDP,
         proportions: Float[Array, "... T"],
         weights: Float[Array, "T K"],
-        sensor: Imperfection,
+        sensor: AnySensor,
         length: int,
         *,
         validate_args: bool | None = None,
@@ -270,7 +270,7 @@ def concentration_prior(
 
 def mixture_model(
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     codes: Int[Array, "n L 3"] | Perceived | None = None,
     *,
     components: int = COMPONENTS,

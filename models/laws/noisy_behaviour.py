@@ -15,7 +15,7 @@ import numpyro.distributions as dist
 from jaxtyping import Array, Bool, Int
 from numpyro.handlers import scale as scaled
 
-from ..observation.evidence import FeatureNoise, Imperfection, Sensor
+from ..observation.evidence import AnySensor, FeatureNoise, Sensor
 from ..process.mdp import TabularMDP
 from .occlusion import scaled_prior
 from .trajectory import TrajectoryLaw
@@ -58,7 +58,7 @@ def noisy_behaviour_model(
     predicates: Bool[Array, "J S A"] | Int[Array, "J S A"],
     codes: Int[Array, "n L 3"] | None = None,
     *,
-    view: Imperfection | None = None,
+    view: AnySensor | None = None,
     reportable: Bool[Array, "S A"] | None = None,
     n_trajectories: int | None = None,
     length: int | None = None,

@@ -16,7 +16,7 @@ from numpyro.distributions import constraints
 from numpyro.distributions.transforms import AffineTransform, ComposeTransform, Transform
 from numpyro.handlers import scale as scaled
 
-from ..observation.evidence import Imperfection
+from ..observation.evidence import AnySensor
 from ..process.mdp import TabularMDP
 from ..process.units import feature_scale
 from .trajectory import TrajectoryLaw
@@ -109,7 +109,7 @@ def scaled_prior(mdp: TabularMDP, prior: dist.Distribution | None = None) -> Sca
 
 def occlusion_model(
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     codes: Int[Array, "n L 3"] | None = None,
     *,
     n_trajectories: int | None = None,

@@ -12,7 +12,7 @@ from numpyro.distributions.util import validate_sample
 
 from ..inputs.arguments import as_key
 from ..observation.demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration
-from ..observation.evidence import Imperfection, checked_codes, fitting_sensor, observe, step_log_evidence
+from ..observation.evidence import AnySensor, checked_codes, fitting_sensor, observe, step_log_evidence
 from ..process.mdp import TabularMDP
 from ..process.planning import reward_of, simulate, soft_plan
 from .chain import filter_all
@@ -78,7 +78,7 @@ class TrajectoryLaw(dist.Distribution):
         self,
         mdp: TabularMDP,
         weights: Float[Array, " K"],
-        sensor: Imperfection,
+        sensor: AnySensor,
         length: int,
         *,
         validate_args: bool | None = None,

@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..inputs.arguments import concrete, is_traced, rebuilt_unchecked
-from .evidence import Imperfection, ObservationModel, Sensor
+from .evidence import AnySensor, ObservationModel, Sensor
 
 
 class _ConfusionFields(NamedTuple):
     reports: Int[Array, "M S A"]
-    noise: Float[Array, " M"]
+    chances: Float[Array, " M"]
 
 
 @rebuilt_unchecked
@@ -28,7 +28,7 @@ class Confusions(_ConfusionFields):
     reports : int ``[M, S, A]``
         What each confusion takes a pair for, as the flat index ``s * A + a``; the pair itself where it has
         nothing to confuse. A pair is confused in one way at most.
-    noise : float ``[M]``
+    chances : float ``[M]``
         Probability of each, where it acts.
 
     Raises
@@ -39,33 +39,33 @@ class Confusions(_ConfusionFields):
 
     __slots__ = ()
 
-    def __new__(cls, reports: np.ndarray | Array, noise: np.ndarray | Array) -> Confusions:
+    def __new__(cls, reports: np.ndarray | Array, chances: np.ndarray | Array) -> Confusions:
         """Check and convert; see the class."""
         flat = jnp.asarray(reports if is_traced(reports) else _checked(np.asarray(reports)))
-        p = concrete("noise", noise)
+        p = concrete("chances", chances)
         if p is not None:
             if p.shape != flat.shape[:1]:
                 raise ValueError(f"{len(flat)} confusions need as many probabilities, got {list(p.shape)}")
             for m in np.flatnonzero(~((p >= 0) & (p <= 1))):
                 raise ValueError(f"a confusion has a probability in [0, 1]; that of confusion {m} is {p[m]}")
-        return super().__new__(cls, flat, jnp.asarray(noise if p is None else p, float))
+        return super().__new__(cls, flat, jnp.asarray(chances if p is None else p, float))
 
     @staticmethod
     def of_actions(
-        n_states: int, pairs: list[tuple[int, int]], noise: np.ndarray, n_actions: int
+        n_states: int, pairs: list[tuple[int, int]], chances: np.ndarray, n_actions: int
     ) -> Confusions:
-        """``(truth, report)`` of actions, the same in every state; ``noise`` has an entry for each."""
+        """``(truth, report)`` of actions, the same in every state; ``chances`` has an entry for each."""
         reports = np.tile(np.arange(n_states * n_actions).reshape(n_states, n_actions), (len(pairs), 1, 1))
         for m, (truth, report) in enumerate(pairs):
             reports[m, :, truth] = reports[m, :, report]
-        return Confusions(reports, np.asarray(noise, float))
+        return Confusions(reports, np.asarray(chances, float))
 
-    def __mul__(self, other: Imperfection) -> Sensor:  # type: ignore[override]
+    def __mul__(self, other: AnySensor) -> Sensor:  # type: ignore[override]
         """Compose with another imperfection, such as a :class:`Visibility`."""
-        return self.reading * other
+        return self.noise * other
 
     @property
-    def presence(self) -> None:
+    def visibility(self) -> None:
         """Noise hides nothing."""
         return None
 
@@ -75,10 +75,10 @@ class Confusions(_ConfusionFields):
         return self.reports != jnp.arange(self.reports[0].size).reshape(self.reports.shape[1:])
 
     @property
-    def reading(self) -> ObservationModel:
+    def noise(self) -> ObservationModel:
         """``O(o | g)``: the noise at the confusion's report, the rest at the pair itself."""
         shape, size = self.reports.shape[1:], self.reports[0].size
-        chance = jnp.where(self.acts, self.noise[:, None, None], 0.0).reshape(len(self.noise), size)
+        chance = jnp.where(self.acts, self.chances[:, None, None], 0.0).reshape(len(self.chances), size)
         g = jnp.arange(size)
         table = jnp.zeros((size, size)).at[g, g].add(1 - chance.sum(0))
         table = table.at[g, self.reports.reshape(-1, size)].add(chance)
@@ -86,7 +86,7 @@ class Confusions(_ConfusionFields):
 
     def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
         """Which confusion turned each truth into its report (flat indices); none where none does."""
-        flat = self.reports.reshape(len(self.noise), -1)[:, truth]
+        flat = self.reports.reshape(len(self.chances), -1)[:, truth]
         return ((flat == report) & (flat != truth)).T
 
 

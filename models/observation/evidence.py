@@ -23,72 +23,74 @@ from ..process.mdp import PairNames, TabularMDP
 from .demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
 
 
-class Imperfection(Protocol):
+class AnySensor(Protocol):
     """Anything that turns what was perceived into evidence; methods never ask which one they were given."""
 
     @property
-    def presence(self) -> Float[Array, " S"] | None:
+    def visibility(self) -> Float[Array, " S"] | None:
         """Probability that a step in each state is in view; None means always."""
 
     @property
-    def reading(self) -> ObservationModel | None:
+    def noise(self) -> ObservationModel | None:
         """What perception reports of a step in view; None means exactly the truth."""
 
 
 class _Composable:
     """Products of imperfections."""
 
-    def __mul__(self: Imperfection, other: Imperfection) -> Sensor:
+    def __mul__(self: AnySensor, other: AnySensor) -> Sensor:
         other = as_sensor(other)
-        if self.reading is not None and other.reading is not None:
+        if self.noise is not None and other.noise is not None:
             raise ValueError("a sensor has one reading: two observation models cannot be multiplied")
-        if self.presence is None or other.presence is None:
-            presence = self.presence if other.presence is None else other.presence
+        if self.visibility is None or other.visibility is None:
+            visibility = self.visibility if other.visibility is None else other.visibility
         else:
-            if self.presence.shape != other.presence.shape:
+            if self.visibility.shape != other.visibility.shape:
                 raise ValueError(
                     f"views must be of one number of states to be multiplied; got shapes "
-                    f"{self.presence.shape} and {other.presence.shape}"
+                    f"{self.visibility.shape} and {other.visibility.shape}"
                 )
-            presence = self.presence * other.presence
-        return Sensor._make((presence, self.reading if other.reading is None else other.reading))
+            visibility = self.visibility * other.visibility
+        return Sensor._make((visibility, self.noise if other.noise is None else other.noise))
 
 
 class _SensorFields(NamedTuple):
-    presence: Float[Array, " S"] | None = None
-    reading: ObservationModel | None = None
+    visibility: Float[Array, " S"] | None = None
+    noise: ObservationModel | None = None
 
 
 @rebuilt_unchecked
 class Sensor(_Composable, _SensorFields):  # type: ignore[misc]
     """A product of imperfections; ``Sensor()`` sees everything exactly.
 
-    ``presence`` and ``reading`` may also be imperfections that have one. Raises ``ValueError`` for a presence
+    ``visibility`` and ``noise`` may also be imperfections that have one. Raises ``ValueError`` for a presence
     that is no probability and ``TypeError`` for a reading that reports nothing.
     """
 
     __slots__ = ()
 
-    def __new__(cls, presence: Any = None, reading: Any = None) -> Sensor:
+    def __new__(cls, visibility: Any = None, noise: Any = None) -> Sensor:
         """Check and convert; see the class."""
-        if presence is not None:
-            presence = presence.presence if _is_sensor(presence) else _checked_view("presence", presence)
-        if reading is not None and not hasattr(reading, "log_likelihood"):
-            if not _is_sensor(reading):
-                raise TypeError(f"reading must be an ObservationModel or None; got {described(reading)}")
-            reading = reading.reading
-        return super().__new__(cls, presence, reading)
+        if visibility is not None:
+            visibility = (
+                visibility.visibility if _is_sensor(visibility) else _checked_view("visibility", visibility)
+            )
+        if noise is not None and not hasattr(noise, "log_likelihood"):
+            if not _is_sensor(noise):
+                raise TypeError(f"reading must be an ObservationModel or None; got {described(noise)}")
+            noise = noise.noise
+        return super().__new__(cls, visibility, noise)
 
 
 def _is_sensor(given: Any) -> bool:
     # Looked up statically, as a reading may be a large table that is computed when it is asked for.
     missing = object()
     return not isinstance(given, type) and not any(
-        getattr_static(given, name, missing) is missing for name in ("presence", "reading")
+        getattr_static(given, name, missing) is missing for name in ("visibility", "noise")
     )
 
 
-def as_sensor(given: Any) -> Imperfection:
+def as_sensor(given: Any) -> AnySensor:
     """Take a sensor, or make a :class:`Visibility` of a mask of the states in view.
 
     Raises ``TypeError`` for anything else and ``ValueError`` for a mask that is no probability.
@@ -142,12 +144,12 @@ class Visibility(_Composable, _VisibilityFields):  # type: ignore[misc]
         return super().__new__(cls, _checked_view("in_view", in_view))
 
     @property
-    def presence(self) -> Float[Array, " S"]:
+    def visibility(self) -> Float[Array, " S"]:
         """The view itself."""
         return self.in_view
 
     @property
-    def reading(self) -> None:
+    def noise(self) -> None:
         """What is in view is seen exactly."""
         return None
 
@@ -207,12 +209,12 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
         return ObservationModel.from_probabilities(einsum("so,ap->saop", *factors))
 
     @property
-    def presence(self) -> None:
+    def visibility(self) -> None:
         """Noise hides nothing."""
         return None
 
     @property
-    def reading(self) -> ObservationModel:
+    def noise(self) -> ObservationModel:
         """The model itself."""
         return self
 
@@ -327,12 +329,12 @@ class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
         )
 
     @property
-    def presence(self) -> None:
+    def visibility(self) -> None:
         """Noise hides nothing."""
         return None
 
     @property
-    def reading(self) -> ObservationModel:
+    def noise(self) -> ObservationModel:
         """The normalised observation model, which also injects the noise."""
         return ObservationModel._make((self.log_probabilities,))
 
@@ -389,18 +391,18 @@ def checked_predicates(predicates: ArrayLike) -> Bool[np.ndarray, "J S A"] | Int
     return psi.astype(bool) if np.isin(psi, (0, 1)).all() else psi.astype(int)
 
 
-def fitting_sensor(sensor: Any, mdp: TabularMDP) -> Imperfection:
+def fitting_sensor(sensor: Any, mdp: TabularMDP) -> AnySensor:
     """Take a sensor, or a mask of the states in view, that fits the process.
 
     Raises ``TypeError`` as :func:`as_sensor` does, and ``ValueError`` for a sensor that was made for another
     number of states or actions than the MDP has.
     """
     sensor = as_sensor(sensor)
-    if sensor.presence is not None and sensor.presence.shape[-1:] != (mdp.n_states,):
+    if sensor.visibility is not None and sensor.visibility.shape[-1:] != (mdp.n_states,):
         raise ValueError(
-            f"the sensor's view has shape {sensor.presence.shape}, but the MDP has {mdp.n_states} states"
+            f"the sensor's view has shape {sensor.visibility.shape}, but the MDP has {mdp.n_states} states"
         )
-    table = getattr(sensor.reading, "log_probabilities", None)
+    table = getattr(sensor.noise, "log_probabilities", None)
     if table is not None and table.shape[-2:] != (mdp.n_states, mdp.n_actions):
         raise ValueError(
             f"the observation model is about {table.shape[-2]} states and {table.shape[-1]} actions, "
@@ -503,7 +505,7 @@ def _check_codes(
 
 
 def step_log_evidence(
-    sensor: Imperfection,
+    sensor: AnySensor,
     n_states: int,
     n_actions: int,
     kind: Int[Array, ""],
@@ -516,15 +518,15 @@ def step_log_evidence(
     Minus infinity for what cannot be perceived: an index of no state or action, or another kind.
     """
     shape = (n_states, n_actions)
-    presence = jnp.ones(n_states) if sensor.presence is None else sensor.presence
-    if sensor.reading is None:
+    visibility = jnp.ones(n_states) if sensor.visibility is None else sensor.visibility
+    if sensor.noise is None:
         match_state = (state == UNKNOWN) | (jnp.arange(n_states) == state)
         match_action = (action == UNKNOWN) | (jnp.arange(n_actions) == action)
-        reading = jnp.where(match_state[:, None] & match_action, 0.0, -jnp.inf)
+        noise = jnp.where(match_state[:, None] & match_action, 0.0, -jnp.inf)
     else:
-        reading = sensor.reading.log_likelihood(state, action, score)
-    seen = reading + safe_log(presence)[:, None]
-    hidden = jnp.broadcast_to(safe_log(1 - presence)[:, None], shape)
+        noise = sensor.noise.log_likelihood(state, action, score)
+    seen = noise + safe_log(visibility)[:, None]
+    hidden = jnp.broadcast_to(safe_log(1 - visibility)[:, None], shape)
     # An index beyond an array is clamped to its last entry: it would be learned from as another state.
     in_range = (state >= UNKNOWN) & (state < n_states) & (action >= UNKNOWN) & (action < n_actions)
     nothing = jnp.where((kind == LOST) | (kind == PAD), jnp.zeros(shape), -jnp.inf)
@@ -536,9 +538,7 @@ def safe_log(probability: Array) -> Array:
     return jnp.where(probability > 0, jnp.log(jnp.where(probability > 0, probability, 1.0)), -jnp.inf)
 
 
-def log_evidence(
-    sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration
-) -> Float[Array, "n L S A"]:
+def log_evidence(sensor: AnySensor, mdp: TabularMDP, demonstration: Demonstration) -> Float[Array, "n L S A"]:
     """``log e_t(s, a)`` of every step of every trajectory.
 
     Raises ``ValueError`` for a sensor made for another number of states or actions, and as
@@ -551,7 +551,7 @@ def log_evidence(
 
 
 def observe(
-    key: Array, sensor: Imperfection, states: Int[Array, " L"], actions: Int[Array, " L"]
+    key: Array, sensor: AnySensor, states: Int[Array, " L"], actions: Int[Array, " L"]
 ) -> Int[Array, "L 3"]:
     """Pass a true trajectory through a sensor: codes (kind, state, action) of what is perceived."""
 
@@ -560,10 +560,10 @@ def observe(
     def one(key: Array, state: Int[Array, ""], action: Int[Array, ""]) -> Int[Array, " 3"]:
         look, read = jax.random.split(key)
         seen: Bool[Array, ""] = jnp.array(True)
-        if sensor.presence is not None:
-            seen = jax.random.uniform(look) < sensor.presence[state]
-        if sensor.reading is not None:
-            state, action = sensor.reading.report(read, state, action)
+        if sensor.visibility is not None:
+            seen = jax.random.uniform(look) < sensor.visibility[state]
+        if sensor.noise is not None:
+            state, action = sensor.noise.report(read, state, action)
         values = jnp.stack([jnp.array(SEEN), state, action])
         return jnp.where(seen, values, jnp.array([HIDDEN, UNKNOWN, UNKNOWN])).astype(jnp.int32)
 
@@ -575,7 +575,7 @@ _evidence = jax.jit(step_log_evidence, static_argnums=(1, 2))
 
 
 def require_possible(
-    sensor: Imperfection, mdp: TabularMDP, demonstration: Demonstration, record: str = "trajectory"
+    sensor: AnySensor, mdp: TabularMDP, demonstration: Demonstration, record: str = "trajectory"
 ) -> None:
     """Raise :class:`DemonstrationError` at the first step that no behaviour of the MDP could have produced.
 
@@ -589,22 +589,22 @@ def require_possible(
     name = PairNames(mdp.labels)
     names = {SEEN: "seen", HIDDEN: "hidden", LOST: "lost"}
     start = np.asarray(mdp.initial) > 0
-    presence = np.ones(mdp.n_states) if sensor.presence is None else np.asarray(sensor.presence)
+    visibility = np.ones(mdp.n_states) if sensor.visibility is None else np.asarray(sensor.visibility)
     for i in range(demonstration.n_trajectories):
         states = start
         for t, (kind, s, a, score) in enumerate(zip(*(np.asarray(x)[i] for x in demonstration), strict=True)):
             if kind == PAD:
                 break
-            if kind == SEEN and sensor.reading is None:
+            if kind == SEEN and sensor.noise is None:
                 pairs = np.zeros_like(available)
                 pairs[slice(None) if s == UNKNOWN else s, slice(None) if a == UNKNOWN else a] = True
-                pairs &= (presence > 0)[:, None]
+                pairs &= (visibility > 0)[:, None]
             elif kind == SEEN:
                 pairs = (
                     np.asarray(_evidence(sensor, mdp.n_states, mdp.n_actions, kind, s, a, score)) > -np.inf
                 )
             elif kind == HIDDEN:
-                pairs = np.broadcast_to((presence < 1)[:, None], available.shape)
+                pairs = np.broadcast_to((visibility < 1)[:, None], available.shape)
             else:
                 pairs = np.ones_like(available)
             allowed = pairs & available

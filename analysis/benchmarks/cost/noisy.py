@@ -35,7 +35,7 @@ from ....domains.noisy.tasks import NoisyTask, demonstrate_noisy, noisy_patrol, 
 from ....domains.object_world.process import random_object_world
 from ....inference.completion.smoothing import Evidence, smooth_all
 from ....inference.learners.alternation import checked_method, newton
-from ....inference.learners.noisy import DEFAULT_ERRORS, DEFAULT_MEMORY, DEFAULT_RIDGE, rifom, rimeo
+from ....inference.learners.noisy import DEFAULT_ERRORS, DEFAULT_FORGETTING, DEFAULT_RIDGE, rifom, rimeo
 from ....inference.programs.maximum_entropy import WarmStart
 from ....inference.sensors.observations import (
     fit_sensor,
@@ -203,7 +203,7 @@ def part_seconds(task: NoisyTask, sessions: int = 20, runs: int = 200) -> dict[s
     for one in stream.seen.sessions(stream.trajectories):
         state, _ = learner.update(state, one)
     method = checked_method(mdp, Sensor(), "seen", "exact", 0.0, DEFAULT_RIDGE, 0)
-    perception = entropic_perception(classes, "stepwise", "posterior", DEFAULT_ERRORS, DEFAULT_MEMORY)
+    perception = entropic_perception(classes, "stepwise", "posterior", DEFAULT_ERRORS, DEFAULT_FORGETTING)
     session = prepare(mdp, classes, one.bucketed(), True)
     confidence = session.reports.score[..., None, None]
     plan = method.plan(state.weights, state.values)
@@ -212,7 +212,7 @@ def part_seconds(task: NoisyTask, sessions: int = 20, runs: int = 200) -> dict[s
     completed = complete(mdp, posterior, session.live, session.reports.seen)
     told = report_statistic(classes, state.logits, session.reports, confidence, posterior.pairs)
     heard = perception.blend(state.reports, told)
-    working = blend(state.statistic, method.statistic.of_session(mdp, plan, completed), DEFAULT_MEMORY)
+    working = blend(state.statistic, method.statistic.of_session(mdp, plan, completed), DEFAULT_FORGETTING)
     slack, ridge = method.penalties(working, state.session + 1)
     start = WarmStart(state.weights, plan.values)
     parts: dict[str, tuple[Callable[..., Any], tuple]] = {

@@ -113,7 +113,7 @@ def online_against_batch(sessions: int, runs: int, rerun_points: int = 12) -> di
             spent.append(seconds(partial(batch.fit, key, part)))
         if seed == 0:
             continue
-        total = sum(r.seconds for r in run_sessions(learner, demonstration.sessions(), key=key).reports)
+        total = sum(r.seconds for r in run_sessions(learner, demonstration.sessions(), key=key).infos)
         online.append(total)
         once.append(spent[-1])
         rerun.append(float(np.interp(np.arange(1, sessions + 1), points, spent).sum()))
@@ -150,7 +150,7 @@ def session_cost(mdp: TabularMDP, length: int, trajectories: int, sessions: int 
         np.where(inside, full.action, UNKNOWN), full.score,
     )  # fmt: skip
     run = run_sessions(lme_i2rl(mdp, view), hidden.sessions(trajectories), key=jax.random.key(0))
-    return float(np.median([r.seconds / r.iterations for r in run.reports[2:]]))
+    return float(np.median([r.seconds / r.iterations for r in run.infos[2:]]))
 
 
 def main() -> None:

@@ -59,7 +59,7 @@ class CounterState(NamedTuple):
     session: int
 
 
-class CounterReport(NamedTuple):
+class CounterInfo(NamedTuple):
     """A number that follows from the session's, and something of some size."""
 
     square: int
@@ -96,7 +96,7 @@ def learn(path: Path, sessions: int, committed: Callable[[int], object] = lambda
         here = journal.position
         for session in range(journal.session + 1, sessions + 1):
             here = here.after(f"line {session}")
-            report = CounterReport(session**2, np.arange(60.0) + session)
+            report = CounterInfo(session**2, np.arange(60.0) + session)
             journal.commit(learner.after(session), report, here, session.to_bytes(16, "big"))
             committed(session)
 
@@ -128,7 +128,7 @@ def outcome(left: Left, peace: Content) -> Outcome:
     found, total = [], len(peace.sessions)
     try:
         with Journal.read(left.path) as view:
-            found = [record.session for record in view.reports()]
+            found = [record.session for record in view.records()]
     except JournalError as error:
         begun = "is empty" not in str(error) and "does not exist" not in str(error)
         if begun or left.reported:

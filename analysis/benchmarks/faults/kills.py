@@ -128,7 +128,7 @@ def content(path: Path) -> Content:
                 tuple(record.position),
                 [(k, np.asarray(v).tobytes()) for k, v in record.report.items() if k != "seconds"],
             )
-            for record in view.reports()
+            for record in view.records()
         ]
         state = [(name, str(value.dtype), value.tobytes()) for name, value in _arrays(view.stored_state())]
         return Content(sessions, [(view.session, state)] if state else [])

@@ -43,7 +43,7 @@ from ....inference.sessions.learner import Learner
 from ....inference.sessions.running import run_sessions
 from ....models.laws.trajectory import TrajectoryLaw, sample_demonstration
 from ....models.observation.demonstration import Demonstration
-from ....models.observation.evidence import FeatureNoise, Imperfection, Sensor, Visibility
+from ....models.observation.evidence import AnySensor, FeatureNoise, Sensor, Visibility
 from ....models.process.mdp import TabularMDP
 from ....models.process.planning import feature_expectations, occupancy, reward_of, soft_plan
 from ....models.process.units import feature_scale
@@ -96,7 +96,7 @@ def greedy_policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, 
 @cache
 def demonstration(sensor: str = "clear") -> Demonstration:
     """Twelve trajectories of the expert, seen clearly, half hidden, or through noise."""
-    seen: dict[str, Imperfection] = {"clear": Sensor(), "hidden": VIEW, "noisy": NOISE}
+    seen: dict[str, AnySensor] = {"clear": Sensor(), "hidden": VIEW, "noisy": NOISE}
     weights = jnp.asarray(TRUTH / feature_scale(process()))
     return sample_demonstration(jax.random.key(3), TrajectoryLaw(process(), weights, seen[sensor], 6), 12)
 
@@ -147,14 +147,16 @@ METHODS: Mapping[str, Callable[[TabularMDP], Array | np.ndarray]] = {
     ).weights,
     "darko_i2rl": _learned(lambda mdp: darko_i2rl(mdp, radius=2.0)),
     "jin_i2rl_with_features": _learned(jin_i2rl_with_features),
-    "mme_mtirl": _learned(lambda mdp: mme_mtirl(mdp, ways=2, restarts=1, l1=0.01)),
+    "mme_mtirl": _learned(lambda mdp: mme_mtirl(mdp, n_components=2, restarts=1, slack=0.01)),
     "mlirl": lambda mdp: mlirl(KEY, mdp, demonstration(), restarts=2, iterations=40).weights,
-    "em_mlirl": lambda mdp: em_mlirl(mdp, clusters=2, iterations=4).fit(KEY, demonstration()).weights,
-    "dpm_birl": lambda mdp: dpm_birl(mdp, sweeps=15, sigma=0.1).fit(KEY, demonstration()).weights,
+    "em_mlirl": lambda mdp: em_mlirl(mdp, n_components=2, iterations=4).fit(KEY, demonstration()).weights,
+    "dpm_birl": lambda mdp: dpm_birl(mdp, iterations=15, sigma=0.1).fit(KEY, demonstration()).weights,
     "birl": lambda mdp: birl(KEY, mdp, demonstration(), draws=30, warmup=30, chains=2)["posterior"][
         "weights"
     ].values[0],
-    "batch_mme_mtirl": lambda mdp: batch_mme_mtirl(mdp, ways=2, restarts=1).fit(KEY, demonstration()).weights,
+    "batch_mme_mtirl": lambda mdp: (
+        batch_mme_mtirl(mdp, n_components=2, restarts=1).fit(KEY, demonstration()).weights
+    ),
     "posterior mode": _mode,
     "lme_i2rl": _learned(lambda mdp: lme_i2rl(mdp, VIEW), "hidden"),
     "lme_i2rl counts": _learned(lambda mdp: lme_i2rl(mdp, VIEW, statistic="counts", ridge=0.3), "hidden"),

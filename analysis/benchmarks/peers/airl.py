@@ -36,14 +36,14 @@ class Setting(NamedTuple):
     env: str
     n_envs: int
     n_steps: int
-    rounds: int
+    iterations: int
     updates: int
     batch: int
 
     @property
     def steps(self) -> int:
         """Environment steps in all."""
-        return self.n_envs * self.n_steps * self.rounds
+        return self.n_envs * self.n_steps * self.iterations
 
 
 HOPPER = Setting("Hopper-v4", 4, 256, 20, 4, 256)
@@ -103,7 +103,7 @@ def _learner(agent: PPO, setting: Setting, **training: Any) -> Any:
     if setting not in _LEARNERS:
         environment = agent.environment
         how = AdversarialTraining(
-            rounds=setting.rounds, updates=setting.updates, batch=setting.batch, **training
+            iterations=setting.iterations, updates=setting.updates, batch=setting.batch, **training
         )
         discriminator = airl_discriminator(environment.observation_size, environment.actions)
         _LEARNERS[setting] = adversarial("AIRL", agent, discriminator, training=how)

@@ -39,7 +39,7 @@ def accuracies(
         for patroller, demonstration in enumerate(demonstrate(key, patrol, observability, max(points))):
             start = jax.random.fold_in(key, patroller)
             for name, learner in learners.items():
-                reports = run_sessions(learner, demonstration.sessions(), key=start).reports
+                reports = run_sessions(learner, demonstration.sessions(), key=start).infos
                 weights[name].append([reports[n - 1].weights for n in points])
             fits = [batch.fit(start, demonstration.select(slice(0, n))) for n in points]
             weights["batch"].append([fit.weights for fit in fits])

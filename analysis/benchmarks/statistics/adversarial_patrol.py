@@ -129,7 +129,7 @@ def noise_study(
     sessions: int,
     trials: int,
     levels: Sequence[float],
-    rounds: int,
+    iterations: int,
 ) -> None:
     """Every method at the first level; at the others, on ``few`` runs, what shows the cost of noise.
 
@@ -156,7 +156,7 @@ def noise_study(
         count, tried = (runs, trials) if everything else (min(few, runs), 0)
         streams = streams_of(level)
         make, seen = noise_methods(streams, patrol)[name]
-        learner = make(memory=memory, rounds=rounds)
+        learner = make(memory=memory, iterations=iterations)
         own = Demonstration(*(x[:count] for x in seen))
 
         def action(
@@ -181,11 +181,11 @@ def noise_study(
         file.measure("noise", f"{name}, {level:g}, memory {memory:g}", action)
 
 
-def view_study(file: _File, *, runs: int, sessions: int, rounds: int) -> None:
+def view_study(file: _File, *, runs: int, sessions: int, iterations: int) -> None:
     """GAIL and LME-I2RL at three degrees of observability."""
     patrol = instance(2)
     mdp = patrol.mdp
-    options: dict[str, Any] = {"rounds": rounds, "updates": 5, "horizon": 8, **GAIL_OPTIONS}
+    options: dict[str, Any] = {"iterations": iterations, "updates": 5, "horizon": 8, **GAIL_OPTIONS}
     for view in VIEWS:
         seen = view_streams(patrol, view, runs, sessions)
         visibility = patrol.visibility(view)
@@ -253,10 +253,12 @@ def main() -> None:
     if given.part != "view":
         noise_study(
             file, runs=given.runs, few=given.few, sessions=given.sessions, trials=given.trials,
-            levels=given.levels, rounds=given.rounds,
+            levels=given.levels, iterations=given.iterations,
         )  # fmt: skip
     if given.part != "noise":
-        view_study(file, runs=max(given.runs // 4, 1), sessions=given.view_sessions, rounds=given.rounds)
+        view_study(
+            file, runs=max(given.runs // 4, 1), sessions=given.view_sessions, iterations=given.iterations
+        )
     _print(file.results)
     for path in write_figures(file.results, given.out.parent):
         print(f"Written to {path}")

@@ -154,16 +154,19 @@ def draw_mixtures(key: Array, replications: int, setting: Setting, components: i
 
 def moments(idata: az.InferenceData) -> dict[str, Float[np.ndarray, "chain draw"]]:
     """Draws of quantities whatever the ways are called; their means are the moments compared."""
-    invariant, ways = label_invariant(idata), idata["assignments"].assignment.values
+    invariant, components = label_invariant(idata), idata["assignments"].assignment.values
     found = {
-        f"trajectories {i} and {j} together": ways[..., i] == ways[..., j]
-        for i, j in itertools.combinations(range(ways.shape[-1]), 2)
+        f"trajectories {i} and {j} together": components[..., i] == components[..., j]
+        for i, j in itertools.combinations(range(components.shape[-1]), 2)
     }
-    found |= {f"{k} ways": invariant.n_ways.values == k for k in range(1, ways.shape[-1] + 1)}
-    found |= {"number of ways": invariant.n_ways.values, "concentration": invariant.concentration.values}
+    found |= {f"{k} ways": invariant.n_components.values == k for k in range(1, components.shape[-1] + 1)}
+    found |= {
+        "number of ways": invariant.n_components.values,
+        "concentration": invariant.concentration.values,
+    }
     found |= {name: invariant[name].values for name in ("log_likelihood", "log_joint")}
     found["largest proportion"] = invariant.proportion.values[..., 0]
-    for i, name in itertools.product(range(ways.shape[-1]), invariant.feature.values):
+    for i, name in itertools.product(range(components.shape[-1]), invariant.feature.values):
         drawn = invariant.trajectory_weights.sel(feature=name).isel(trajectory=i)
         found[f"weight of {name} in trajectory {i}"] = drawn.values
     return {name: np.asarray(draws, float) for name, draws in found.items()}
@@ -201,7 +204,7 @@ def agreement(
                 "mixture": r, "sampler": name, "seconds": spent,
                 "R-hat": max(float(az.rhat(x)) for x in varying),
                 "ESS": min(float(az.ess(x, method="mean")) for x in varying),
-                "ways": float(data[-1]["assignments"].n_ways.mean()),
+                "components": float(data[-1]["assignments"].n_components.mean()),
             })  # fmt: skip
         compared += compare(r, *data)
     return compared, mixed
@@ -212,7 +215,7 @@ def invariant_statistics(drawn: Drawn, feature_names: tuple[str, ...]) -> dict[s
     counts = (drawn.assignment[..., None] == np.arange(drawn.proportions.shape[-1])).sum(-2)
     first = np.take_along_axis(drawn.weights, drawn.assignment[..., :1, None], axis=-2)[..., 0, :]
     ranked = {
-        "ways": (counts > 0).sum(-1),
+        "components": (counts > 0).sum(-1),
         "pairs together": (counts * (counts - 1) // 2).sum(-1),
         "concentration": drawn.concentration,
         "largest proportion": drawn.proportions.max(-1),

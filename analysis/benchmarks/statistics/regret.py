@@ -43,7 +43,7 @@ from ....inference.learners.lme import DEFAULT_SLACK, lme_i2rl, me_i2rl
 from ....inference.sessions.learner import Learner
 from ....inference.sessions.schedule import Harmonic, Schedule
 from ....models.observation.demonstration import Demonstration
-from ....models.observation.evidence import Imperfection, Sensor, observe
+from ....models.observation.evidence import AnySensor, Sensor, observe
 from ....models.process.planning import occupancy, reward_of, simulate, soft_plan
 from ...bounds.regret import (
     BoundCurve,
@@ -89,7 +89,7 @@ def streams(codes: np.ndarray) -> Demonstration:
 
 
 def _walks(
-    key: Array, patrol: Patrol, log_policy: Array, sensor: Imperfection, shape: tuple[int, int]
+    key: Array, patrol: Patrol, log_policy: Array, sensor: AnySensor, shape: tuple[int, int]
 ) -> np.ndarray:
     """``shape[0]`` trajectories of ``shape[1]`` steps as codes."""
 

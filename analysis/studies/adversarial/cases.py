@@ -31,7 +31,7 @@ class Plan(NamedTuple):
     Fields
     ------
     sessions : int
-    rounds : int, of discriminator and generator in a session; SSRR shares them out over its two policies
+    iterations : int, of discriminator and generator in a session; SSRR shares them out over its two policies
     trajectories : int, demonstrated in a session
     covariance : float, of a Gaussian sensor, for states and actions
     shift, probability : float, of mountain car's sensor
@@ -44,7 +44,7 @@ class Plan(NamedTuple):
     """
 
     sessions: int = 8
-    rounds: int = 20
+    iterations: int = 20
     trajectories: int = 1
     covariance: float = 0.05
     shift: float = MOUNTAIN_CAR_SHIFT
@@ -133,7 +133,7 @@ PLANS = {
     "half-cheetah": Plan(process=1e-3),
     "mountain-car": Plan(
         sessions=20,
-        rounds=10,
+        iterations=10,
         trajectories=2,
         learning_rate=3e-3,
         episodes=40,

@@ -75,7 +75,7 @@ def confusions_of(patrol: Patrol, forward_as_left: float, right_as_forward: floa
 def noisy_streams(patrol: Patrol, level: float, runs: int, sessions: int, seed: int = 0) -> Streams:
     """Reports of the patroller's greedy expert; the truth is the same at every level."""
     confusions = confusions_of(patrol, level, level)
-    sensor = Sensor(None, confusions.reading)
+    sensor = Sensor(None, confusions.noise)
     log_policy = jnp.log(jnp.asarray(patrol.expert_policy()))
 
     def one(key: Array) -> tuple[Array, Array, Array]:
@@ -193,7 +193,7 @@ def patrol_results(
     noise: float = 1.0,
     *,
     trials: int = 40,
-    rounds: int = 30,
+    iterations: int = 30,
     advance: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> AdversarialResults:
     """AIRL on the truth and on reports, and robust-AIRL with the sensor given or learned.
@@ -207,7 +207,7 @@ def patrol_results(
         Times the 5 % of both confusions.
     trials : int
         Breaches tried with each learned policy.
-    rounds : int
+    iterations : int
         Of discriminator and generator in a session.
     advance : callable
         Told what was done, and what share of all.
@@ -229,7 +229,8 @@ def patrol_results(
     level, patrol = noise * LEVEL, instance(2)
     streams = noisy_streams(patrol, level, seeds, sessions)
     learners = {
-        name: make(memory=0.0, rounds=rounds) for name, make in noise_learners(patrol, streams.sensor).items()
+        name: make(memory=0.0, iterations=iterations)
+        for name, make in noise_learners(patrol, streams.sensor).items()
     }
     learners[CLEAN] = learners[NOISY]  # compiled once
     methods, noises, first = {}, [], np.zeros(0)
@@ -264,7 +265,7 @@ def patrol_results(
         settings={
             MISREPORT: level,
             "sessions": sessions,
-            "rounds": rounds,
+            "iterations": iterations,
             "memory of earlier sessions": 0.0,
             "trials of a breach, a policy": trials,
             "probability of a misreport, before it is learned": ASSUMED,

@@ -97,12 +97,12 @@ def learner(name: str, method: str, plan: Plan) -> Learner:
     agent = ppo(task, **dict(plan.settings))
     discriminator = airl_discriminator(task.observation_size, task.actions, agent.settings.gamma)
     training = AdversarialTraining(
-        plan.rounds,
+        plan.iterations,
         plan.updates,
         plan.batch,
         plan.learning_rate,
         penalty=plan.penalty,
-        refresh=plan.rounds,
+        refresh=plan.iterations,
     )
     if method in (CLEAN, NOISY):
         return adversarial("AIRL", agent, discriminator, training=training)
@@ -117,12 +117,14 @@ def learner(name: str, method: str, plan: Plan) -> Learner:
     # The same steps in all: ranking takes some, and the rest is halved between imitation and the end.
     sessions = plan.sessions // _gathered(method, plan)
     ranking = len(_SSRR_LEVELS) * _SSRR_EPISODES * task.horizon / agent.settings.steps
-    half = max(int((plan.sessions * plan.rounds / sessions - ranking) // 2), 1)
+    half = max(int((plan.sessions * plan.iterations / sessions - ranking) // 2), 1)
     return ssrr(
         agent,
         airl_discriminator(task.observation_size, task.actions, agent.settings.gamma, state_only=True),
         NoisyTraining(half, plan.updates, plan.batch, plan.learning_rate),
-        SSRRTraining(_SSRR_LEVELS, _SSRR_EPISODES, _REGRESSION, rounds=half, average="median", start="first"),
+        SSRRTraining(
+            _SSRR_LEVELS, _SSRR_EPISODES, _REGRESSION, iterations=half, average="median", start="first"
+        ),
     )
 
 

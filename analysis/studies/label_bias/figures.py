@@ -188,8 +188,8 @@ def draw_sweep(study: LabelBiasStudy, theme: Theme) -> Figure:
     for blocked, results in study.sweep.items():
         style = styles[names[blocked]]
         low, median, high = np.array([quantiles(result.birl) for result in results]).T
-        axes.fill_between(study.etas, low, high, color=style["color"], alpha=0.2, linewidth=0)
-        handles += axes.plot(study.etas, median, label=names[blocked], markersize=5, **style)
+        axes.fill_between(study.rationalities, low, high, color=style["color"], alpha=0.2, linewidth=0)
+        handles += axes.plot(study.rationalities, median, label=names[blocked], markersize=5, **style)
     handles.append(axes.axhline(1.0, color=styles["MaxEnt"]["color"], linewidth=2, label="MaxEnt"))
     handles.append(
         axes.axhline(

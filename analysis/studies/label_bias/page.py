@@ -71,7 +71,7 @@ def _summary(study: LabelBiasStudy) -> dict[str, Any]:
         "seed": study.seed,
         "median world": {"BIRL": study.birl._asdict(), "MaxEnt": study.maxent._asdict()},
         "settings": _rows(study),
-        "sweep": {"eta": list(study.etas), **sweep},
+        "sweep": {"rationality": list(study.rationalities), **sweep},
         "dissertation": {
             "rho": PRINTED_RHO,
             "p": PRINTED_P,
@@ -110,8 +110,10 @@ def _tables(study: LabelBiasStudy) -> tuple[Table, ...]:
         for row, result in zip(_rows(study), study.results, strict=True)
     ]
     sweep = [
-        (f"{eta:g}", *_told_of_birl(stay), *_told_of_birl(go))
-        for eta, stay, go in zip(study.etas, study.sweep[True], study.sweep[False], strict=True)
+        (f"{rationality:g}", *_told_of_birl(stay), *_told_of_birl(go))
+        for rationality, stay, go in zip(
+            study.rationalities, study.sweep[True], study.sweep[False], strict=True
+        )
     ]
     return (
         table,
@@ -131,7 +133,7 @@ def _tables(study: LabelBiasStudy) -> tuple[Table, ...]:
             "for choices. MaxEnt: the largest deviation in any world.",
         ),
         Table(
-            ("eta", "rho, blocked moves stay", "p < 0.05", "rho, only open moves", "p < 0.05"),
+            ("rationality", "rho, blocked moves stay", "p < 0.05", "rho, only open moves", "p < 0.05"),
             sweep,
             f"BIRL with Boltzmann experts of the same eta, {STEPS} steps, discount {DISCOUNT:g}.",
         ),
@@ -202,7 +204,7 @@ def _conditions(study: LabelBiasStudy) -> str:
 
 
 def _eta_of(result: SettingResult) -> str:
-    return f"{result.setting.eta:g}"
+    return f"{result.setting.rationality:g}"
 
 
 def print_tables(study: LabelBiasStudy, console: Console) -> None:

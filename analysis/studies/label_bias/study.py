@@ -2,8 +2,9 @@
 
 Object World with deterministic moves, a finite number of steps and no discount in a trajectory's total
 reward, where the law of maximum entropy is ``P(X) = exp(reward(X)) / Z`` exactly; ``Z`` sums over where a
-trajectory begins as well. Bayesian IRL multiplies ``pi(a | s) ~ exp(eta Q*(s, a))`` over the pairs, each
-normalised over the actions of its own state: that is where the number of choices met on the way comes in.
+trajectory begins as well. Bayesian IRL multiplies ``pi(a | s) ~ exp(rationality Q*(s, a))`` over the pairs,
+each normalised over the actions of its own state: that is where the number of choices met on the way comes
+in.
 """
 
 from __future__ import annotations
@@ -43,19 +44,19 @@ class Setting(NamedTuple):
 
     ``expert`` demonstrates: ``Boltzmann`` follows the very law that BIRL scores with, ``optimal`` shares its
     steps evenly among the best actions, ``maximum entropy`` follows the law that MaxEnt scores with.
-    ``eta`` and ``discount`` are BIRL's. ``blocked`` says whether moves against walls are actions.
+    ``rationality`` and ``discount`` are BIRL's. ``blocked`` says whether moves against walls are actions.
     """
 
     expert: str = BOLTZMANN
-    eta: float = 1.0
+    rationality: float = 1.0
     discount: float = DISCOUNT
     steps: int = STEPS
     blocked: bool = True
 
     @property
     def name(self) -> str:
-        """For example ``Boltzmann experts, eta 1``; what is as in the first setting goes unsaid."""
-        parts = [f"{self.expert} experts", f"eta {self.eta:g}"]
+        """For example ``Boltzmann experts, rationality 1``; what is as in the first setting goes unsaid."""
+        parts = [f"{self.expert} experts", f"eta {self.rationality:g}"]
         parts += [f"discount {self.discount:g}"] * (self.discount != DISCOUNT)
         parts += [f"{self.steps} steps"] * (self.steps != STEPS)
         parts += ["only open moves"] * (not self.blocked)
@@ -68,14 +69,14 @@ class Setting(NamedTuple):
 FIRST = Setting()
 SETTINGS = (
     FIRST,
-    Setting(eta=10.0),
+    Setting(rationality=10.0),
     Setting(OPTIMAL),
-    Setting(OPTIMAL, eta=10.0),
+    Setting(OPTIMAL, rationality=10.0),
     Setting(MAXENT),
     Setting(steps=20),
     Setting(discount=0.9),
     Setting(blocked=False),
-    Setting(OPTIMAL, eta=10.0, blocked=False),
+    Setting(OPTIMAL, rationality=10.0, blocked=False),
 )
 
 
@@ -84,8 +85,8 @@ class Trajectories(NamedTuple):
 
     ``states, actions [n, T]``; ``reward [n]`` undiscounted; ``maxent`` and ``birl [n]`` log-likelihoods in
     nats (BIRL's without the start, which it has no law for); ``choice [n]``, the nats that BIRL takes off
-    for choices met on the way, ``sum_t log sum_a exp(eta (Q(s_t, a) - max Q(s_t)))``. BIRL is ``eta`` times
-    the sum of advantages, less ``choice``.
+    for choices met on the way, ``sum_t log sum_a exp(rationality (Q(s_t, a) - max Q(s_t)))``. BIRL is
+    ``rationality`` times the sum of advantages, less ``choice``.
     """
 
     states: Int[Array, "n T"]
@@ -132,7 +133,7 @@ def _share(which: np.ndarray, p: np.ndarray) -> Share:
 
 
 class LabelBiasStudy(NamedTuple):
-    """Settings and results; ``sweep`` holds a result for each of ``etas``, for both kinds of walls.
+    """Settings and results; ``sweep`` holds a result for each of ``rationalities``, for both kinds of walls.
 
     ``world``, ``trajectories`` and the two correlations are those of the world whose BIRL correlation in the
     first setting is the median over worlds (the lower one of two).
@@ -143,7 +144,7 @@ class LabelBiasStudy(NamedTuple):
     walls: int
     seed: int
     results: tuple[SettingResult, ...]
-    etas: tuple[float, ...]
+    rationalities: tuple[float, ...]
     sweep: dict[bool, tuple[SettingResult, ...]]
     world: ObjectWorld
     trajectories: Trajectories
@@ -158,7 +159,7 @@ def label_bias_study(
     walls: int = WALLS,
     seed: int = 0,
     settings: Sequence[Setting] = SETTINGS,
-    etas: Sequence[float] = ETAS,
+    rationalities: Sequence[float] = ETAS,
     advance: Advance = lambda description, fraction: None,
 ) -> LabelBiasStudy:
     """Correlate log-likelihood and total reward of expert trajectories, in many worlds and settings.
@@ -180,12 +181,12 @@ def label_bias_study(
     }
     weights = jnp.asarray(drawn[0].weights)
     keys = jax.random.split(walk, worlds)
-    stages = len(settings) + 2 * len(etas)
+    stages = len(settings) + 2 * len(rationalities)
     results, first = [], None
     for i, setting in enumerate(settings):
         advance(setting.name, i / stages)
         walked = _in_every_world(
-            keys, stacked[setting.blocked], weights, setting.eta, setting.discount,
+            keys, stacked[setting.blocked], weights, setting.rationality, setting.discount,
             _expert_code(setting.expert), steps=setting.steps, n=trajectories,
         )  # fmt: skip
         first = walked if first is None else first
@@ -193,18 +194,25 @@ def label_bias_study(
     sweep = {}
     for j, (blocked, mdps) in enumerate(stacked.items()):
         rows = []
-        for i, eta in enumerate(etas):
-            advance(f"eta {eta:g}", (len(settings) + j * len(etas) + i) / stages)
+        for i, rationality in enumerate(rationalities):
+            advance(f"eta {rationality:g}", (len(settings) + j * len(rationalities) + i) / stages)
             walked = _in_every_world(
-                keys, mdps, weights, eta, DISCOUNT, _expert_code(BOLTZMANN), steps=STEPS, n=trajectories
+                keys,
+                mdps,
+                weights,
+                rationality,
+                DISCOUNT,
+                _expert_code(BOLTZMANN),
+                steps=STEPS,
+                n=trajectories,
             )
-            rows.append(_result(Setting(eta=eta, blocked=blocked), walked))
+            rows.append(_result(Setting(rationality=rationality, blocked=blocked), walked))
         sweep[blocked] = tuple(rows)
     shown = _median_world(results[0].birl)
     of_world: Trajectories = jax.tree.map(lambda x: x[shown], first)
     advance("done", 1.0)
     return LabelBiasStudy(
-        worlds, trajectories, walls, seed, tuple(results), tuple(etas), sweep,
+        worlds, trajectories, walls, seed, tuple(results), tuple(rationalities), sweep,
         drawn[shown] if settings[0].blocked else without_blocked_moves(drawn[shown]), of_world,
         correlation(np.asarray(of_world.birl), np.asarray(of_world.reward)),
         correlation(np.asarray(of_world.maxent), np.asarray(of_world.reward)),
@@ -272,7 +280,7 @@ def _in_every_world(
     keys: Array,
     mdps: TabularMDP,
     weights: Float[Array, " K"],
-    eta: float,
+    rationality: float,
     discount: float,
     expert: int,
     *,
@@ -281,7 +289,7 @@ def _in_every_world(
 ) -> Trajectories:
     return lax.map(
         lambda world: _drawn_and_scored(
-            world[0], replace(world[1], discount=discount), weights, eta, expert, steps, n
+            world[0], replace(world[1], discount=discount), weights, rationality, expert, steps, n
         ),
         (keys, mdps),
     )
@@ -291,7 +299,7 @@ def demonstrate_and_score(
     key: Array,
     mdp: TabularMDP,
     weights: Float[Array, " K"],
-    eta: float,
+    rationality: float,
     *,
     expert: str,
     steps: int,
@@ -302,7 +310,7 @@ def demonstrate_and_score(
     Boltzmann and optimal experts begin in a cell drawn from the initial distribution; where those of maximum
     entropy begin is part of their law. Raises ``ValueError`` for another expert.
     """
-    return _drawn_and_scored(key, _bare(mdp), weights, eta, _expert_code(expert), steps, n)
+    return _drawn_and_scored(key, _bare(mdp), weights, rationality, _expert_code(expert), steps, n)
 
 
 def _expert_code(expert: str) -> int:
@@ -316,7 +324,7 @@ def _drawn_and_scored(
     key: Array,
     mdp: TabularMDP,
     weights: Float[Array, " K"],
-    eta: float,
+    rationality: float,
     expert: int,
     steps: int,
     n: int,
@@ -324,7 +332,7 @@ def _drawn_and_scored(
     reward = reward_of(mdp, weights)
     law = finite_soft_plan(replace(mdp, discount=jnp.ones(())), reward, steps)
     values = optimal_action_values(mdp, weights)
-    boltzmann = boltzmann_log_policy(mdp, weights, eta)
+    boltzmann = boltzmann_log_policy(mdp, weights, rationality)
     best = greedy_actions(values)
     optimal = jnp.log(best / best.sum(1, keepdims=True))
     begins = jax.nn.log_softmax(law.values[0])
@@ -333,7 +341,7 @@ def _drawn_and_scored(
     unchanging = jnp.broadcast_to(jnp.stack([boltzmann, optimal])[:, None], (2, *law.log_policy.shape))
     policies = jnp.concatenate([unchanging, law.log_policy[None]])[expert]
     states, actions = jax.vmap(lambda k: _walk(k, mdp, start, policies))(jax.random.split(key, n))
-    choices = jax.nn.logsumexp(eta * (values - values.max(1, keepdims=True)), axis=1)
+    choices = jax.nn.logsumexp(rationality * (values - values.max(1, keepdims=True)), axis=1)
     return Trajectories(
         states,
         actions,

@@ -120,9 +120,9 @@ class MethodCurve(NamedTuple):
 class MethodsStudy(NamedTuple):
     """Settings, the pairs seen at which accuracy was measured, the methods' curves, and the sweeps.
 
-    ``sweeps`` holds for each method with a learning rate its score at each of ``rates`` on the tuning
-    demonstrations: the median over streams of the mean accuracy over ``points``. ``chance`` are LBAs of
-    random weights, ``visits`` the first stream's visits of each state.
+    ``sweeps`` holds for each method with a learning learning_rate its score at each of ``learning_rates`` on
+    the tuning demonstrations: the median over streams of the mean accuracy over ``points``. ``chance`` are
+    LBAs of random weights, ``visits`` the first stream's visits of each state.
     """
 
     patrol: Patrol
@@ -131,7 +131,7 @@ class MethodsStudy(NamedTuple):
     seed: int
     points: Int[np.ndarray, " points"]
     curves: tuple[MethodCurve, ...]
-    rates: tuple[float, ...]
+    learning_rates: tuple[float, ...]
     sweeps: Mapping[str, Float[np.ndarray, " rates"]]
     table: pandas.DataFrame
     chance: Float[np.ndarray, " draws"]
@@ -163,7 +163,7 @@ def methods_study(
     sessions: int = 120,
     runs: int = 3,
     seed: int = 0,
-    rates: Sequence[float] = RATES,
+    learning_rates: Sequence[float] = RATES,
     methods: Sequence[str] | None = None,
     advance: Advance = lambda description, fraction: None,
 ) -> MethodsStudy:
@@ -171,7 +171,7 @@ def methods_study(
 
     A stream is ``sessions`` windows of five pairs. Windows are the sessions of all methods but DARKO, whose
     sessions end at the goals (:func:`turning_places`); what it learned at the last goal counts until the
-    next. Each learning rate is the :func:`chosen_rate` of ``rates`` by their score (see
+    next. Each learning rate is the :func:`chosen_rate` of ``learning_rates`` by their score (see
     :class:`MethodsStudy`) on one further run, drawn for this and used for nothing else.
     ``methods`` names some of the methods, all by default. Raises ``ValueError`` for an instance or a method
     that does not exist.
@@ -188,13 +188,15 @@ def methods_study(
     curves, sweeps = [], {}
     for i, (name, entry) in enumerate(entries.items()):
         advance(name, i / len(entries))
-        rate = None
+        learning_rate = None
         if entry.tuned:
-            tried = [_accuracies(patrol, entry, float(r), tuning, points)[0].mean(1) for r in rates]
+            tried = [_accuracies(patrol, entry, float(r), tuning, points)[0].mean(1) for r in learning_rates]
             sweeps[name] = np.median(tried, axis=1)
-            rate = chosen_rate(rates, sweeps[name])
-        measured, weights = _accuracies(patrol, entry, 1.0 if rate is None else rate, streams, points)
-        curves.append(MethodCurve(name, measured, rate, weights))
+            learning_rate = chosen_learning_rate(learning_rates, sweeps[name])
+        measured, weights = _accuracies(
+            patrol, entry, 1.0 if learning_rate is None else learning_rate, streams, points
+        )
+        curves.append(MethodCurve(name, measured, learning_rate, weights))
     advance("done", 1.0)
     table = methods_table(patrol.mdp, streams[0][1])
     chance = chance_accuracy(
@@ -203,28 +205,43 @@ def methods_study(
     first = streams[0][1]
     visits = np.bincount(first.state[first.kind == SEEN], minlength=patrol.mdp.n_states).astype(float)
     return MethodsStudy(
-        patrol, sessions, runs, seed, points, tuple(curves), tuple(rates), sweeps, table, chance, visits
+        patrol,
+        sessions,
+        runs,
+        seed,
+        points,
+        tuple(curves),
+        tuple(learning_rates),
+        sweeps,
+        table,
+        chance,
+        visits,
     )
 
 
 def _entries(patrol: Patrol) -> dict[str, _Entry]:
     mdp, goals = patrol.mdp, turning_places(patrol)
     return {
-        "Jin et al., table over states": _Entry(lambda rate: jin_i2rl(mdp, learning_rate=rate)),
-        "Jin et al., features": _Entry(lambda rate: jin_i2rl_with_features(mdp, learning_rate=rate)),
-        "DARKO, goals": _Entry(
-            lambda rate: darko_i2rl(mdp, learning_rate=rate), partial(goal_sessions, goals=goals)
+        "Jin et al., table over states": _Entry(
+            lambda learning_rate: jin_i2rl(mdp, learning_rate=learning_rate)
         ),
-        "DARKO, windows of 5": _Entry(lambda rate: darko_i2rl(mdp, learning_rate=rate)),
+        "Jin et al., features": _Entry(
+            lambda learning_rate: jin_i2rl_with_features(mdp, learning_rate=learning_rate)
+        ),
+        "DARKO, goals": _Entry(
+            lambda learning_rate: darko_i2rl(mdp, learning_rate=learning_rate),
+            partial(goal_sessions, goals=goals),
+        ),
+        "DARKO, windows of 5": _Entry(lambda learning_rate: darko_i2rl(mdp, learning_rate=learning_rate)),
         "ME-I2RL, features": _Entry(lambda _: me_i2rl(mdp, statistic="features"), tuned=False),
         "LME-I2RL, seen": _Entry(lambda _: lme_i2rl(mdp, Sensor()), tuned=False),
     }
 
 
-def chosen_rate(rates: Sequence[float], scores: Float[np.ndarray, " rates"]) -> float:
+def chosen_learning_rate(learning_rates: Sequence[float], scores: Float[np.ndarray, " rates"]) -> float:
     """The smallest rate whose score is within 0.01 of the best: larger ones gain too little to tell."""
     good = np.asarray(scores) >= np.max(scores) - 0.01
-    return min(float(rate) for rate, kept in zip(rates, good, strict=True) if kept)
+    return min(float(learning_rate) for learning_rate, kept in zip(learning_rates, good, strict=True) if kept)
 
 
 def _streams(key: Array, patrol: Patrol, sessions: int, runs: int) -> list[tuple[Array, Demonstration]]:
@@ -239,17 +256,17 @@ def _streams(key: Array, patrol: Patrol, sessions: int, runs: int) -> list[tuple
 def _accuracies(
     patrol: Patrol,
     entry: _Entry,
-    rate: float,
+    learning_rate: float,
     streams: Sequence[tuple[Array, Demonstration]],
     points: Int[np.ndarray, " points"],
 ) -> tuple[Float[np.ndarray, "streams points"], Float[np.ndarray, "streams K"]]:
     """Accuracy after so many pairs, and the weights in the end."""
-    learner = entry.learner(rate)
+    learner = entry.learner(learning_rate)
     optimal = optimal_actions(patrol.mdp, jnp.asarray(patrol.weights))
     rows, final = [], []
     for key, windows in streams:
         sessions = list(entry.cut(windows.sessions()))
-        reports = run_sessions(learner, sessions, key=key).reports
+        reports = run_sessions(learner, sessions, key=key).infos
         weights = np.array([learner.init(key).weights, *(report.weights for report in reports)])
         seen = np.cumsum([0, *(int(session.lengths.sum()) for session in sessions)])
         # What was learned at the last session that had ended by then.
@@ -375,7 +392,10 @@ def _tables(study: MethodsStudy) -> tuple[Table, ...]:
             "Median over streams (middle half).",
         ),
         Table(
-            ("mean LBA while learning", *(f"rate {rate:g}" for rate in study.rates)),
+            (
+                "mean LBA while learning",
+                *(f"rate {learning_rate:g}" for learning_rate in study.learning_rates),
+            ),
             sweep,
             "On a run used for nothing else. Above, each method has the smallest rate within 0.01 of its "
             "best. A reward table over states learns the same policy at every rate.",

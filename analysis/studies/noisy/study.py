@@ -35,7 +35,7 @@ from ....inference.sessions.fleets import run_streams
 from ....inference.sessions.learner import Learner
 from ....inference.sessions.running import run_sessions
 from ....models.observation.demonstration import SEEN, Demonstration
-from ....models.observation.evidence import Imperfection, Sensor, Visibility
+from ....models.observation.evidence import AnySensor, Sensor, Visibility
 from ....models.process.mdp import TabularMDP
 from ....models.process.planning import deterministic_policy, hard_plan, reachable_states, reward_of
 from ...judging.metrics import chance_accuracy, optimal_actions
@@ -125,7 +125,7 @@ def draw_streams(
     sessions: int,
     starts: Starts = "all",
     steps: int = STEPS,
-    noise: Imperfection | None = None,
+    noise: AnySensor | None = None,
     view: Visibility | None = None,
 ) -> Streams:
     """Independent streams with calibrated scores, all trajectories drawn in one go.
@@ -254,7 +254,7 @@ class _Entry(NamedTuple):
     perceives: bool = True
 
 
-def _plain_learner(mdp: TabularMDP, sensor: Imperfection) -> Learner:
+def _plain_learner(mdp: TabularMDP, sensor: AnySensor) -> Learner:
     """Maximum-entropy IRL whose settings are those of RIMEO, the sensor being known."""
     return lme_i2rl(mdp, sensor, slack=0.0, ridge=DEFAULT_RIDGE, iterations=DEFAULT_ITERATIONS)
 
@@ -362,7 +362,7 @@ def _kept(perceives: bool, state: Any, report: Any) -> tuple:
 
 def _one_by_one(key: Array, learner: Learner, streams: Streams, run: int) -> tuple:
     sessions = streams.seen.kind.shape[1]
-    reports: Any = run_sessions(learner, (streams.session(run, t) for t in range(sessions)), key=key).reports
+    reports: Any = run_sessions(learner, (streams.session(run, t) for t in range(sessions)), key=key).infos
     return [report.weights for report in reports], [report.agreement for report in reports]
 
 

@@ -218,7 +218,7 @@ def _online(learner: Learner, key: jax.Array, demonstrations: Sequence[Demonstra
     # One session first, unrecorded, so that compilation is not counted as learning.
     learner.update(learner.init(key), demonstrations[0].select([0]))
     runs = [
-        run_sessions(learner, d.sessions(), key=jax.random.fold_in(key, p)).reports
+        run_sessions(learner, d.sessions(), key=jax.random.fold_in(key, p)).infos
         for p, d in enumerate(demonstrations)
     ]
     weights = np.array([[r.weights for r in reports] for reports in runs])

@@ -34,7 +34,7 @@ from ...drawing.charts import set_scale
 from ...drawing.style import MARKERS, SMALL, TEXT, Theme, dress, foot, head, method_styles, new_figure
 from ...drawing.text import counted
 from ...judging.metrics import greedy_policy, optimal_actions, policy_accuracy
-from ...judging.multi_task import match_ways
+from ...judging.multi_task import match_components
 
 if TYPE_CHECKING:
     from .study import SortingStudy
@@ -92,18 +92,18 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
     panels = figure.subplots(rows, columns, sharex=True, sharey=True, squeeze=False).ravel()
     most = 1
     for i, (panel, result) in enumerate(zip(panels, results, strict=False)):
-        ways = _numbered(study.labels, result.found.assignments)
-        found = len(ways)
+        components = _numbered(study.labels, result.found.assignments)
+        found = len(components)
         most = max(most, found)
         for b in range(study.tasks):
-            for d, way in enumerate(ways):
-                rows_here = (study.labels == b) & (result.found.assignments == way)
+            for d, component in enumerate(components):
+                rows_here = (study.labels == b) & (result.found.assignments == component)
                 panel.plot(
                     *embedding.points[rows_here].T, linestyle="", marker=MARKERS[b], markersize=7,
                     markerfacecolor="none", markeredgecolor=theme.series[d % _COLOURS], markeredgewidth=1.5,
                     alpha=0.85,
                 )  # fmt: skip
-        dress(panel, theme, title=f"{result.name}: {counted(found, 'way')}")
+        dress(panel, theme, title=f"{result.name}: {counted(found, 'component')}")
         panel.margins(0.12)
         if i >= len(results) - columns:
             panel.set_xlabel(f"component 1 ({embedding.shares[0]:.1%} of variance)", color=theme.ink)
@@ -138,8 +138,8 @@ def _loading(mdp: TabularMDP, loading: Float[np.ndarray, " K"]) -> str:
 
 def _numbered(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> list[int]:
     """The ways that have trajectories: as the behaviours they match, then those that match none."""
-    matched = [way for _, way in sorted(match_ways(labels, assignments).items())]
-    return matched + [way for way in np.unique(assignments).tolist() if way not in matched]
+    matched = [component for _, component in sorted(match_components(labels, assignments).items())]
+    return matched + [component for component in np.unique(assignments).tolist() if component not in matched]
 
 
 # -- what a way does ----------------------------------------------------------------------------------
@@ -194,7 +194,7 @@ def flow_of(sorting: Sorting, policy: Float[np.ndarray, "S A"], steps: int) -> F
     return Flow(at, drawn)
 
 
-def ways_diagram(study: SortingStudy, theme: Theme) -> Figure:
+def components_diagram(study: SortingStudy, theme: Theme) -> Figure:
     """What each way found makes of an onion: a state diagram a way, of the first method of the study.
 
     Boxes are where the onion is and what is thought of it (hand and list left out); arrows are what the
@@ -202,21 +202,21 @@ def ways_diagram(study: SortingStudy, theme: Theme) -> Figure:
     """
     result, sorting = study.results[0], study.sorting
     sizes = np.bincount(result.found.assignments)
-    ways = _numbered(study.labels, result.found.assignments)
-    shown = ways[:_DIAGRAMS]
+    components = _numbered(study.labels, result.found.assignments)
+    shown = components[:_DIAGRAMS]
     figure = new_figure(theme, max(0.4 + 5.2 * len(shown), _WIDTH_OF_TEXT), 5.9)
     figure.get_layout_engine().set(wspace=0.06)  # type: ignore[union-attr, call-arg]
     panels = figure.subplots(1, len(shown), squeeze=False)[0]
-    behaviour_of = {d: b for b, d in match_ways(study.labels, result.found.assignments).items()}
-    for number, (panel, way) in enumerate(zip(panels, shown, strict=True), start=1):
-        policy = np.asarray(greedy_policy(sorting.mdp, jnp.asarray(result.found.weights[way])))
+    behaviour_of = {d: b for b, d in match_components(study.labels, result.found.assignments).items()}
+    for number, (panel, component) in enumerate(zip(panels, shown, strict=True), start=1):
+        policy = np.asarray(greedy_policy(sorting.mdp, jnp.asarray(result.found.weights[component])))
         draw_flow(panel, theme, sorting, flow_of(sorting, policy, study.steps))
         panel.set_title(
-            f"Way {number}: {sizes[way]} of {counted(len(study.labels), 'trajectory')}\n"
-            + _likeness(sorting, policy, behaviour_of.get(way)),
+            f"Way {number}: {sizes[component]} of {counted(len(study.labels), 'trajectory')}\n"
+            + _likeness(sorting, policy, behaviour_of.get(component)),
             color=theme.ink, fontsize=TEXT + 1, loc="left",
         )  # fmt: skip
-    which = "Ways" if len(ways) == len(shown) else f"{len(shown)} of {len(ways)} ways"
+    which = "Ways" if len(components) == len(shown) else f"{len(shown)} of {len(components)} ways"
     head(figure, theme, [], title=f"{which} found by {result.name}: what is done with an onion")
     foot(
         figure,
@@ -324,13 +324,17 @@ def evd_plot(study: SortingStudy, theme: Theme) -> Figure:
         values = result.measures.value_difference
         _draw_runs(axes, theme, study, i, values, values.mean(0))
     axes.axhline(
-        study.one_way, color=theme.ink, linewidth=1.2, linestyle=(0, (1, 1.5)), label="best single behaviour"
+        study.one_component,
+        color=theme.ink,
+        linewidth=1.2,
+        linestyle=(0, (1, 1.5)),
+        label="best single behaviour",
     )
     values = np.concatenate([r.measures.value_difference.ravel() for r in study.results])
     positive = values[values > 0]
     threshold = 10.0 ** np.floor(np.log10(positive.min() / 2)) if positive.size else 1.0
     axes.set_yscale("symlog", linthresh=threshold, linscale=0.4)
-    axes.set_ylim(-0.12 * threshold, max(float(values.max()), study.one_way) * 2)
+    axes.set_ylim(-0.12 * threshold, max(float(values.max()), study.one_component) * 2)
     dress(axes, theme, x="trajectories", y="expected value difference\n(discounted reward a trajectory)")
     axes.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
     axes.yaxis.set_minor_locator(NullLocator())
@@ -369,19 +373,19 @@ def _draw_runs(
     axes.plot(x, middle, label=result.name, linewidth=1.6, markersize=6.5, clip_on=False, **style)
 
 
-def ways_found_plot(study: SortingStudy, theme: Theme) -> Figure:
+def components_plot(study: SortingStudy, theme: Theme) -> Figure:
     """How many ways were found: at each number of trajectories a disc as large as the share of runs."""
     results = study.results
     figure = new_figure(theme, max(1.2 + 2.3 * len(results), _WIDTH_OF_TEXT), 3.9)
     panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
-    most = max(int(result.measures.ways.max()) for result in results)
+    most = max(int(result.measures.n_components.max()) for result in results)
     # Discs of one column or row must not touch.
     columns = max(len(result.trajectories) for result in results)
     largest = min(34.0, 150.0 / most, 135.0 / columns) ** 2
     for i, (panel, result) in enumerate(zip(panels, results, strict=True)):
         panel.axhline(study.tasks, color=theme.goal, linewidth=1.6, zorder=1)
         for t in range(len(result.trajectories)):
-            numbers, runs = np.unique(result.measures.ways[:, t], return_counts=True)
+            numbers, runs = np.unique(result.measures.n_components[:, t], return_counts=True)
             panel.scatter(
                 np.full(len(numbers), t), numbers, s=largest * runs / study.runs, zorder=2, linewidth=0,
                 color=[theme.series[0] if n == study.tasks else theme.series[1] for n in numbers],

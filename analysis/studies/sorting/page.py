@@ -16,7 +16,7 @@ from ...drawing.page import Lead, Section, Table, drawn, write_page
 from ...drawing.page import print_tables as print_page_tables
 from ...drawing.results import plain, study_provenance
 from ...drawing.text import counted, listed, number
-from ...judging.multi_task import match_ways
+from ...judging.multi_task import match_components
 from ...posteriors.information import complete_information
 from . import figures
 from .study import BATCH, DPM, EM, EM_UNTOLD, FEW, METHODS, ONLINE, SortingStudy
@@ -44,18 +44,18 @@ def summary(study: SortingStudy) -> dict[str, Any]:
         "process": study.sorting.name,
         "tasks": study.tasks,
         "behaviours": list(study.sorting.behaviours[: study.tasks]),
-        "ways started from": study.ways,
+        "ways started from": study.n_components,
         "steps": study.steps,
         "runs": study.runs,
         "seed": study.seed,
-        "EVD of the best single behaviour": study.one_way,
+        "EVD of the best single behaviour": study.one_component,
         "online over batch, seconds": study.online_share,
         "methods": [
             {
                 "method": result.name,
                 "trajectories": result.trajectories.tolist(),
                 "EVD": result.measures.value_difference.tolist(),
-                "ways": result.measures.ways.tolist(),
+                "components": result.measures.n_components.tolist(),
                 "assignment accuracy": result.measures.accuracy.tolist(),
                 "adjusted Rand index": result.measures.rand.tolist(),
                 "seconds": result.measures.seconds.tolist(),
@@ -64,8 +64,9 @@ def summary(study: SortingStudy) -> dict[str, Any]:
             }
             for result in study.results
         ],
-        "ways of the first run": [
-            {"way": way, "weights": found.summary()} for way, found in _estimates(study).items()
+        "components of the first run": [
+            {"component": component, "weights": found.summary()}
+            for component, found in _estimates(study).items()
         ],
         "table 7.2": sorting_table_summary(study.table),
     })  # fmt: skip
@@ -81,18 +82,24 @@ def _estimates(study: SortingStudy) -> dict[str, Estimates]:
     """
     result, mdp = study.results[0], study.sorting.mdp
     demonstration = study.demonstration
-    behaviour_of = {way: b for b, way in match_ways(study.labels, result.found.assignments).items()}
+    behaviour_of = {
+        component: b for b, component in match_components(study.labels, result.found.assignments).items()
+    }
     seen = demonstration.kind == SEEN
     found: dict[str, Estimates] = {}
-    for way in np.unique(result.found.assignments).tolist():
-        weights = np.asarray(result.found.weights[way])
+    for component in np.unique(result.found.assignments).tolist():
+        weights = np.asarray(result.found.weights[component])
         errors = np.full(len(weights), np.inf)
         if result.name in (METHODS[BATCH], METHODS[ONLINE]):
-            share = np.broadcast_to(result.found.responsibilities[:, way, None], seen.shape)
+            share = np.broadcast_to(result.found.responsibilities[:, component, None], seen.shape)
             visits = np.bincount(demonstration.state[seen], share[seen], mdp.n_states)
             information = complete_information(mdp, jnp.asarray(weights), jnp.asarray(visits))
             errors = laplace_errors(np.asarray(information) + np.eye(len(weights)) / PRIOR_SCALE**2)
-        name = study.sorting.behaviours[behaviour_of[way]] if way in behaviour_of else "like no behaviour"
+        name = (
+            study.sorting.behaviours[behaviour_of[component]]
+            if component in behaviour_of
+            else "like no behaviour"
+        )
         found[f"way {len(found) + 1}, {name}"] = Estimates(mdp.feature_names, weights, errors)
     return found
 
@@ -107,7 +114,8 @@ def _results_table(study: SortingStudy) -> Table:
                 result.name if t == 0 else "", f"{n}",
                 f"{number(evd.mean())} ({number(evd.min())} to {number(evd.max())})",
                 number(evd.mean() / study.steps, 2),
-                f"{np.median(m.ways[:, t]):g} ({(m.ways[:, t] == study.tasks).sum()} of {study.runs})",
+                f"{np.median(m.n_components[:, t]):g} "
+                f"({(m.n_components[:, t] == study.tasks).sum()} of {study.runs})",
                 f"{100 * m.accuracy[:, t].mean():.1f}",
                 f"{m.rand[:, t].mean():.3f}",
                 number(np.median(m.seconds[:, t])),
@@ -122,7 +130,7 @@ def _results_table(study: SortingStudy) -> Table:
         ("method", "N", "EVD (all runs)", "a step", "ways (right in)", "accuracy, %", "Rand", "seconds"),
         rows,
         f"N: trajectories. EVD: mean of {_runs(study)}, in discounted reward a trajectory; the best "
-        f"single behaviour for all has {number(study.one_way)}. Ways: median number found. "
+        f"single behaviour for all has {number(study.one_component)}. Ways: median number found. "
         "Rand: adjusted Rand index. "
         f"Seconds: median, without compilation; online: all sessions so far.{online}",
     )
@@ -140,12 +148,12 @@ def _runs(study: SortingStudy) -> str:
 def _text(study: SortingStudy) -> str:
     sizes = ", ".join(map(str, study.counts))
     told = {
-        METHODS[BATCH]: f"MME-MTIRL starts from {study.ways} ways and finds out how many there are.",
+        METHODS[BATCH]: f"MME-MTIRL starts from {study.n_components} ways and finds out how many there are.",
         METHODS[ONLINE]: "Online MME-MTIRL sees every trajectory in one session only and keeps none; it is "
         "judged on all trajectories so far, each assigned by what it knows now.",
         METHODS[DPM]: "DPM-BIRL may find as many ways as there are trajectories.",
         METHODS[EM]: f"EM-MLIRL is given the true number of ways and has {DEFAULT_RESTARTS} starts.",
-        METHODS[EM_UNTOLD]: f"EM-MLIRL that is not told is given {study.ways}, and as many starts.",
+        METHODS[EM_UNTOLD]: f"EM-MLIRL that is not told is given {study.n_components}, and as many starts.",
     }
     methods = " ".join(told[result.name] for result in study.results)
     return f"""Sorters act optimally for one of {study.tasks} rewards; their trajectories of {study.steps} \
@@ -167,10 +175,10 @@ def _scope(study: SortingStudy) -> str:
             "These are few numbers of trajectories, since every method is compiled for each; the "
             "dissertation's design is `--trajectories all --runs 10`."
         )
-    if study.counts[0] < study.ways:
+    if study.counts[0] < study.n_components:
         told.append(
             f"From {counted(int(study.counts[0]), 'trajectory')} no more than {study.counts[0]} of the "
-            f"{study.ways} ways started from can be found."
+            f"{study.n_components} ways started from can be found."
         )
     return " ".join(told)
 
@@ -192,15 +200,15 @@ def print_tables(study: SortingStudy, console: Console) -> None:
 def _lead(study: SortingStudy) -> Lead:
     result = study.results[0]
     m, n = result.measures, int(result.trajectories[-1])
-    right, lost = int((m.ways[:, -1] == study.tasks).sum()), float(m.value_difference[:, -1].mean())
-    found = f"{float(np.median(m.ways[:, -1])):g}"
+    right, lost = int((m.n_components[:, -1] == study.tasks).sum()), float(m.value_difference[:, -1].mean())
+    found = f"{float(np.median(m.n_components[:, -1])):g}"
     learned = (
         f"From one jumble of {counted(n, 'trajectory')} {result.name} learned {found} ways of sorting, where "
         f"{study.tasks} were demonstrated, put {number(100 * float(m.accuracy[:, -1].mean()))} % of the "
         f"trajectories in the right one, and loses {number(lost)} of the value, where one way for all "
-        f"loses {number(study.one_way)}."
+        f"loses {number(study.one_component)}."
     )
-    known = right == study.runs and lost < 0.1 * study.one_way
+    known = right == study.runs and lost < 0.1 * study.one_component
     spread = "one run shows no spread" if study.runs == 1 else f"so it was in {right} of {study.runs} runs"
     trust = (
         f"Trust the ways and what they do ({spread}); the weights of experts who never err have no scale of "
@@ -211,7 +219,7 @@ def _lead(study: SortingStudy) -> Lead:
     )
     tables = [
         estimates.table(
-            f"Weights of {way}, that {result.name} found in the first run. "
+            f"Weights of {component}, that {result.name} found in the first run. "
             + (
                 "Intervals are those of the posterior's curvature under a normal prior of scale "
                 f"{PRIOR_SCALE}, given who did what; one of plus and minus {number(1.96 * PRIOR_SCALE, 2)} "
@@ -220,7 +228,7 @@ def _lead(study: SortingStudy) -> Lead:
                 else "No intervals are computed for its likelihood."
             )
         )
-        for way, estimates in _estimates(study).items()
+        for component, estimates in _estimates(study).items()
     ]
     return Lead(learned, trust, tables)
 
@@ -234,13 +242,13 @@ def write(study: SortingStudy, folder: Path | str) -> Path:
              "All trajectories of the first run by what they count: which way each was done, and which it "
              "was found to be.",
              "Scatter plots of trajectories' feature counts on two principal components, one a method"),
-            ("ways", partial(figures.ways_diagram, study),
+            ("components", partial(figures.components_diagram, study),
              "What a sorter does who follows each way that was found.",
              "State diagrams of each way found: where the onion is, what is thought of it, and what is done"),
             ("evd", partial(figures.evd_plot, study),
              "Value lost by acting as was learned (Figure 7.8).",
              "Expected value difference against trajectories for each method, with the spread over runs"),
-            ("number", partial(figures.ways_found_plot, study),
+            ("number", partial(figures.components_plot, study),
              "How many ways were found.",
              "Number of ways found against trajectories, one panel a method, the true number marked"),
             ("time", partial(figures.time_plot, study),

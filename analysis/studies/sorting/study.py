@@ -20,8 +20,8 @@ from ....domains.sorting.process import Sorting, demonstrate_sorting, sorting_wi
 from ....inference.learners.dpm import dpm_birl
 from ....inference.learners.maximum_likelihood import em_mlirl
 from ....inference.learners.mtirl import (
+    DEFAULT_COMPONENTS,
     DEFAULT_RESTARTS,
-    DEFAULT_WAYS,
     assign_trajectories,
     batch_mme_mtirl,
     mme_mtirl,
@@ -34,7 +34,7 @@ from ...judging.multi_task import (
     adjusted_rand_index,
     assignment_accuracy,
     expected_value_difference,
-    match_ways,
+    match_components,
 )
 from .table import SortingTable, table_7_2
 
@@ -62,7 +62,7 @@ class Measures(NamedTuple):
     ------
     value_difference : float
         EVD, in units of discounted true reward, a trajectory.
-    ways : int
+    n_components : int
         Ways that are the likeliest of some trajectory.
     accuracy : float
         Share of trajectories rightly assigned, under the best matching.
@@ -73,7 +73,7 @@ class Measures(NamedTuple):
     """
 
     value_difference: Float[np.ndarray, "runs T"]
-    ways: Int[np.ndarray, "runs T"]
+    n_components: Int[np.ndarray, "runs T"]
     accuracy: Float[np.ndarray, "runs T"]
     rand: Float[np.ndarray, "runs T"]
     seconds: Float[np.ndarray, "runs T"]
@@ -104,14 +104,14 @@ class SortingStudy(NamedTuple):
     Fields
     ------
     sorting : Sorting
-    tasks, ways, steps, runs, seed : int
+    tasks, n_components, steps, runs, seed : int
         Behaviours demonstrated; ways that learners begin with; steps of a trajectory.
     counts : int ``[T]``
         Numbers of trajectories that batch methods learn from.
     sessions : int ``[J]``
         Trajectories that the online learner has seen at the end of each session.
     results : tuple of MethodResult
-    one_way : float
+    one_component : float
         EVD of the best single behaviour for all trajectories of the first run: what a learner that tells
         nothing apart can reach.
     demonstration, labels
@@ -121,14 +121,14 @@ class SortingStudy(NamedTuple):
 
     sorting: Sorting
     tasks: int
-    ways: int
+    n_components: int
     steps: int
     runs: int
     seed: int
     counts: Int[np.ndarray, " T"]
     sessions: Int[np.ndarray, " J"]
     results: tuple[MethodResult, ...]
-    one_way: float
+    one_component: float
     demonstration: Demonstration
     labels: Int[np.ndarray, " n"]
     table: SortingTable
@@ -162,7 +162,7 @@ def sorting_study(
     seed: int = 0,
     methods: Sequence[str] | None = None,
     sessions: int | None = None,
-    ways: int = DEFAULT_WAYS,
+    n_components: int = DEFAULT_COMPONENTS,
     steps: int = STEPS,
     belts: int = 300,
     advance: Advance = lambda description, fraction: None,
@@ -180,11 +180,11 @@ def sorting_study(
         Independent repetitions. A smaller number of trajectories is the beginning of a larger one's.
     methods : sequence of str, optional
         Keys of :data:`METHODS`, all by default. EM-MLIRL is given the true number of ways, as in the
-        dissertation, or, not told, ``ways`` of them like MME-MTIRL; both from as many starts as that.
+        dissertation, or, not told, ``n_components`` of them like MME-MTIRL; both from as many starts as that.
     sessions : int, optional
         The online learner's, equal in size. By default its sessions end at ``counts``, as in the
         dissertation.
-    ways : int
+    n_components : int
         Ways that MME-MTIRL starts from: the most it can find.
     steps : int
         Of a trajectory.
@@ -196,7 +196,7 @@ def sorting_study(
     ValueError
         For numbers that make no study, saying which.
     """
-    _check(tasks, counts, runs, methods, sessions, ways, steps, belts)
+    _check(tasks, counts, runs, methods, sessions, n_components, steps, belts)
     sizes = np.array(sorted(set(FEW[tasks] if counts is None else counts)))
     most = int(sizes[-1])
     ends = sizes if sessions is None else np.linspace(0, most, sessions + 1).round().astype(int)[1:]
@@ -212,10 +212,10 @@ def sorting_study(
             advance(f"{METHODS[method]}: {what}", (i + share) / len(chosen))
 
         if method == ONLINE:
-            learner = mme_mtirl(sorting.mdp, ways=ways)
+            learner = mme_mtirl(sorting.mdp, n_components=n_components)
             measured = _online(sorting, tasks, learner, ends, streams, tell)
         else:
-            fits = _batch_fits(sorting.mdp, method, tasks, ways, sizes)
+            fits = _batch_fits(sorting.mdp, method, tasks, n_components, sizes)
             with warnings.catch_warnings():
                 # That fewer trajectories than ways give fewer ways is said once, with the results.
                 warnings.filterwarnings("ignore", "[0-9]+ ways were to be started from")
@@ -227,8 +227,8 @@ def sorting_study(
     table = table_7_2(belt, sorting, learned, belts=belts)
     advance("done", 1.0)
     return SortingStudy(
-        sorting, tasks, ways, steps, runs, seed, sizes, ends, tuple(results),
-        _one_way(sorting, tasks, first), first.demonstration, first.labels, table,
+        sorting, tasks, n_components, steps, runs, seed, sizes, ends, tuple(results),
+        _one_component(sorting, tasks, first), first.demonstration, first.labels, table,
     )  # fmt: skip
 
 
@@ -255,7 +255,7 @@ def _check(
     runs: int,
     methods: Sequence[str] | None,
     sessions: int | None,
-    ways: int,
+    n_components: int,
     steps: int,
     belts: int,
 ) -> None:
@@ -263,7 +263,7 @@ def _check(
         raise ValueError(
             f"tasks must be 2 (pick-inspect-place and roll-pick-place) or 3 (and keep claiming), got {tasks}"
         )
-    for name, number in (("ways", ways), ("runs", runs), ("steps", steps), ("belts", belts)):
+    for name, number in (("n_components", n_components), ("runs", runs), ("steps", steps), ("belts", belts)):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
     counts = FEW[tasks] if counts is None else counts
@@ -302,15 +302,17 @@ def _stream(key: Array, sorting: Sorting, tasks: int, borders: Int[np.ndarray, "
 
 
 def _batch_fits(
-    mdp: TabularMDP, method: str, tasks: int, ways: int, sizes: Int[np.ndarray, " T"]
+    mdp: TabularMDP, method: str, tasks: int, n_components: int, sizes: Int[np.ndarray, " T"]
 ) -> dict[int, Callable[[Array, Demonstration], Clustering]]:
     if method == BATCH:
-        return dict.fromkeys(sizes.tolist(), batch_mme_mtirl(mdp, ways=ways).fit)
+        return dict.fromkeys(sizes.tolist(), batch_mme_mtirl(mdp, n_components=n_components).fit)
     if method == DPM:
         return dict.fromkeys(sizes.tolist(), dpm_birl(mdp).fit)
-    given = tasks if method == EM else ways
+    given = tasks if method == EM else n_components
     # EM refuses more ways than trajectories.
-    return {n: em_mlirl(mdp, clusters=min(given, n), restarts=DEFAULT_RESTARTS).fit for n in sizes.tolist()}
+    return {
+        n: em_mlirl(mdp, n_components=min(given, n), restarts=DEFAULT_RESTARTS).fit for n in sizes.tolist()
+    }
 
 
 def _batch(
@@ -401,21 +403,21 @@ def _judged(
 
 def _measures(columns: Sequence[Sequence[tuple[float, ...]]]) -> Measures:
     """From rows of numbers by column and run."""
-    evd, ways, accuracy, rand, seconds = np.array(columns, float).transpose(2, 1, 0)
-    return Measures(evd, ways.astype(int), accuracy, rand, seconds)
+    evd, n_components, accuracy, rand, seconds = np.array(columns, float).transpose(2, 1, 0)
+    return Measures(evd, n_components.astype(int), accuracy, rand, seconds)
 
 
 def _behaviours_of(labels: Int[np.ndarray, " n"], found: Clustering) -> Float[np.ndarray, "B K"]:
     """Learned weights of each behaviour; without a way of its own, that of most of it."""
     assignments = found.assignments
-    matched = match_ways(labels, assignments)
+    matched = match_components(labels, assignments)
     rows = [
         matched.get(int(b), int(np.bincount(assignments[labels == b]).argmax())) for b in np.unique(labels)
     ]
     return found.weights[rows]
 
 
-def _one_way(sorting: Sorting, tasks: int, stream: _Stream) -> float:
+def _one_component(sorting: Sorting, tasks: int, stream: _Stream) -> float:
     nobody_told_apart = np.zeros(len(stream.labels), int)
     return min(
         expected_value_difference(

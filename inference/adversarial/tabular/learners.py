@@ -29,7 +29,7 @@ from ....models.inputs.arguments import as_key
 from ....models.networks.modules import DTYPE
 from ....models.observation.demonstration import Demonstration, DemonstrationError
 from ....models.observation.evidence import (
-    Imperfection,
+    AnySensor,
     Sensor,
     checked_demonstration,
     fitting_sensor,
@@ -62,7 +62,7 @@ from .discriminator import (
 )
 from .training import (
     OCCUPANCIES,
-    TabularAdversarialReport,
+    TabularAdversarialInfo,
     TabularAdversarialState,
     TabularTraining,
 )
@@ -84,7 +84,7 @@ def airl_tabular(mdp: TabularMDP, **options: Any) -> Learner:
     return _at_face_value("AIRL", mdp, tabular_airl, _AIRL, options)
 
 
-def robust_airl_tabular(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Learner:
+def robust_airl_tabular(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Learner:
     """robust-AIRL: the posterior of the truth behind the reports, in exact expectation.
 
     Parameters
@@ -116,7 +116,7 @@ def robust_airl_tabular(mdp: TabularMDP, sensor: Imperfection, **options: Any) -
 
 def gibbs_airl_tabular(
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     *,
     draws: int = 20,
     burn_in: int = 20,
@@ -156,7 +156,7 @@ def robust_airl_with_learned_sensor(
     mdp: TabularMDP,
     assumed: ConfusionNoise,
     *,
-    view: Imperfection | None = None,
+    view: AnySensor | None = None,
     trust: float = 2.0,
     **options: Any,
 ) -> Learner:
@@ -169,12 +169,12 @@ def robust_airl_with_learned_sensor(
     if not trust > 0:
         raise ValueError(f"trust in the assumed probabilities must be positive, got {trust}")
     view = None if view is None else fitting_sensor(view, mdp)
-    if view is not None and view.reading is not None:
+    if view is not None and view.noise is not None:
         raise ValueError("the view says what is hidden; how reports err is learned, not given")
-    noise = np.asarray(assumed.noise)
+    noise = np.asarray(assumed.chances)
     for m in np.flatnonzero(~((noise > 0) & (noise < 1))):
         raise ValueError(f"learning starts from probabilities in (0, 1); that of confusion {m} is {noise[m]}")
-    sensor = fitting_sensor(Sensor(None if view is None else view.presence, assumed.reading), mdp)
+    sensor = fitting_sensor(Sensor(None if view is None else view.visibility, assumed.noise), mdp)
     known: Any = (assumed, view)
     settings = {"truth": "exact, sensor learned", "trust": trust, "sensor": digest_of(known)}
     look = _Look(_exact(mdp), np.asarray(mdp.successors), sensor, assumed, trust)
@@ -190,7 +190,7 @@ def gail_tabular(mdp: TabularMDP, **options: Any) -> Learner:
     return _at_face_value("GAIL", mdp, tabular_gail, _GAIL, options)
 
 
-def robust_gail_tabular(mdp: TabularMDP, sensor: Imperfection, **options: Any) -> Learner:
+def robust_gail_tabular(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Learner:
     """GAIL on the posterior of the truth behind the reports; options as for :func:`robust_airl_tabular`."""
     return _in_expectation("robust-GAIL", mdp, sensor, tabular_gail, _GAIL, options)
 
@@ -207,7 +207,7 @@ class _Look(NamedTuple):
 
     truth: Callable[[Array, Float[Array, "S A"], Any, Demonstration, int, Float[Array, "S A U"]], Completed]
     successors: np.ndarray
-    sensor: Imperfection | None
+    sensor: AnySensor | None
     learned: ConfusionNoise | None = None
     trust: float = 0.0
 
@@ -224,7 +224,7 @@ def _exact(mdp: TabularMDP) -> Callable[..., Completed]:
 def _in_expectation(
     name: str,
     mdp: TabularMDP,
-    sensor: Imperfection,
+    sensor: AnySensor,
     kind: Callable[..., TabularDiscriminator],
     defaults: TabularTraining,
     options: Mapping[str, Any],
@@ -287,7 +287,7 @@ def _learner(
         key, fresh = jax.random.split(as_key(key))
         network = discriminator.init(fresh)
         uniform = jnp.where(mdp.available, -jnp.log(jnp.sum(mdp.available, 1, keepdims=True)), -jnp.inf)
-        none = None if look.learned is None else jnp.zeros(len(look.learned.noise))
+        none = None if look.learned is None else jnp.zeros(len(look.learned.chances))
         return TabularAdversarialState(
             network, optimiser.init(network), uniform, jnp.zeros(mdp.n_states),
             TransitionStatistic(
@@ -306,8 +306,8 @@ def _learner(
             logits = discriminator.logits(network, log_policy, successors)
             if look.learned is None:
                 return look.truth(key, log_policy, given, demonstration, how.horizon, logits), confusions
-            believed = look.learned._replace(noise=fitted_confusions(look.learned, confusions, look.trust))
-            sensor = Sensor(look.sensor.presence, believed.reading)  # type: ignore[union-attr]
+            believed = look.learned._replace(chances=fitted_confusions(look.learned, confusions, look.trust))
+            sensor = Sensor(look.sensor.visibility, believed.noise)  # type: ignore[union-attr]
             evidence = evidence_of(mdp, sensor, demonstration)
             completed = look.truth(key, log_policy, evidence, demonstration, how.horizon, logits)
             new = confusion_counts(believed, jnp.sum(completed.steps, -1), demonstration)
@@ -335,7 +335,7 @@ def _learner(
             last = jax.tree.map(lambda x: x[-1].astype(float), met)
             return (network, memory, log_policy, values, confusions), last
 
-        keys = jax.random.split(state.key, how.rounds + 2)
+        keys = jax.random.split(state.key, how.iterations + 2)
         begun = (state.network, state.optimiser, state.log_policy, state.values, state.confusions)
         carry, met = cast(tuple, lax.scan(round_, begun, keys[2:]))
         network, memory, log_policy, values, confusions = carry
@@ -358,10 +358,10 @@ def _learner(
             noise = fitted_confusions(look.learned, new.confusions, look.trust)
         fields: dict[str, Any] = {
             "session": new.session, "log_likelihood": own / jnp.maximum(trajectories, 1),
-            "demonstration_log_likelihood": own, "iterations": how.rounds, "noise": noise,
+            "demonstration_log_likelihood": own, "iterations": how.iterations, "noise": noise,
             "seconds": jnp.array(jnp.nan), "weights": new.weights,
         }  # fmt: skip
-        return TabularAdversarialReport(**fields, **met._asdict())
+        return TabularAdversarialInfo(**fields, **met._asdict())
 
     run = jax.jit(session)
 

@@ -20,7 +20,7 @@ class TabularTraining(NamedTuple):
 
     Fields
     ------
-    rounds : int
+    iterations : int
         Rounds of discriminator and generator.
     updates : int
         Of the discriminator in a round.
@@ -43,7 +43,7 @@ class TabularTraining(NamedTuple):
         Longest trajectory of a demonstration.
     """
 
-    rounds: int = 30
+    iterations: int = 30
     updates: int = 4
     learning_rate: float = 3e-3
     entropy: float = 1.0
@@ -55,7 +55,7 @@ class TabularTraining(NamedTuple):
 
     def checked(self) -> TabularTraining:
         """Itself. Raises ``ValueError`` naming a field that cannot be."""
-        for name in ("rounds", "updates", "horizon"):
+        for name in ("iterations", "updates", "horizon"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
         for name in ("learning_rate", "step"):
@@ -105,7 +105,7 @@ class TabularAdversarialState(NamedTuple):
         return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(self.network)])
 
 
-class TabularAdversarialReport(NamedTuple):
+class TabularAdversarialInfo(NamedTuple):
     """What a session did.
 
     Fields
@@ -116,7 +116,7 @@ class TabularAdversarialReport(NamedTuple):
         the reported actions given the reported states.
     demonstration_log_likelihood : float
         The same in all.
-    loss, expert_accuracy, generated_accuracy : float ``[rounds]``
+    loss, expert_accuracy, generated_accuracy : float ``[iterations]``
         Of the discriminator: cross-entropy in nats, and the shares of either side it told right.
     iterations : int
         Rounds.

@@ -160,14 +160,15 @@ def ascend_printed(
     gradient: AssignmentGradient = printed_assignment_gradient,
     sweeps: int = 20,
     steps: int = 10,
-    rate: float = 0.01,
+    learning_rate: float = 0.01,
     ridge: float = 1e-2,
 ) -> tuple[Float[np.ndarray, "n D"], Float[np.ndarray, "D K"]]:
     """Descend in the weights, to the end, and ascend in the assignments, a little, in turn.
 
     The weights of a component match its features, ``exp(pi_d theta_d.f)`` normalised over the space. The
-    assignments take ``steps`` steps of length ``rate``, kept positive and normalised after each (the released
-    code does neither, and leaves them unbounded). Returns assignments ``[n, D]`` and weights ``[D, K]``.
+    assignments take ``steps`` steps of length ``learning_rate``, kept positive and normalised after each (the
+    released code does neither, and leaves them unbounded). Returns assignments ``[n, D]`` and weights ``[D,
+    K]``.
     """
     shown = space.features[: space.demonstrated]
     if len(assignments) != len(shown):
@@ -181,7 +182,7 @@ def ascend_printed(
     for _ in range(sweeps):
         weights = np.stack([matched_weights(space, share, ridge) for share in current.T])
         for _ in range(steps):
-            moved = current + rate * gradient(space, current, weights)
+            moved = current + learning_rate * gradient(space, current, weights)
             current = np.clip(moved, _LEAST_ASSIGNMENT, 1e6)
             current = current / current.sum(1, keepdims=True)
     return current, weights

@@ -15,7 +15,7 @@ from i2rl.analysis.bounds.stopping import (
     sweep_tolerance,
 )
 from i2rl.analysis.drawing.style import DARK, LIGHT
-from i2rl.inference import LikelihoodChange, MovingWindow, PolicyWindow, Report
+from i2rl.inference import LikelihoodChange, MovingWindow, PolicyWindow, SessionInfo
 from i2rl.inference.sessions.stopping import LearningErrorChange
 from i2rl.models import deterministic_policy, hard_plan, policy_values, reward_of
 
@@ -38,7 +38,7 @@ def reports():
     weights = np.array([1.0, -1.0]) + 4 * rng.normal(size=(STREAMS, SESSIONS, 2)) / t[:, None] ** 1.3
     return [
         [
-            Report(
+            SessionInfo(
                 int(i), likelihood[s, i - 1], 0.0, gradient[s, i - 1], 1, 1, True, 0.0, weights[s, i - 1]
             )
             for i in t
@@ -95,7 +95,7 @@ def test_a_window_longer_than_the_stream_never_stops(reports):
 
 def test_a_window_of_policies_waits_for_agreement(mdp):
     def report(*weights):
-        return Report(1, 0.0, 0.0, 0.0, 1, 1, True, 0.0, np.array(weights))
+        return SessionInfo(1, 0.0, 0.0, 0.0, 1, 1, True, 0.0, np.array(weights))
 
     stop = PolicyWindow(3, 0.0, mdp)
     same, opposite = report(1.0, -1.0), report(-1.0, 1.0)

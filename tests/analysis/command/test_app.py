@@ -263,7 +263,7 @@ def test_learning_again_goes_on_where_it_stopped(house):
     assert "0 sessions learned (4 were in" in call(*options(house)).stdout
     call(*options(house, journal=house / "whole.db"))
     with Journal.read(house / "learned.db") as often, Journal.read(house / "whole.db") as once:
-        for mine, theirs in zip(often.reports(), once.reports(), strict=True):
+        for mine, theirs in zip(often.records(), once.records(), strict=True):
             np.testing.assert_array_equal(mine.weights, theirs.weights)
 
 
@@ -271,7 +271,7 @@ def test_json_is_what_the_journal_holds(house):
     learned = [json.loads(line) for line in call(*options(house), "--json").stdout.splitlines()]
     shown = json.loads(call("show", house / "learned.db", "--json").stdout)
     with Journal.read(house / "learned.db") as view:
-        records = list(view.reports())
+        records = list(view.records())
     assert [r["session"] for r in learned] == [s["session"] for s in shown["sessions"]] == [1, 2, 3, 4]
     for report, session, record in zip(learned, shown["sessions"], records, strict=True):
         assert report["weights"] == session["weights"] == record.weights.tolist()
@@ -299,7 +299,7 @@ def test_the_history_is_exported_as_netcdf(house):
     assert "history.nc" in told.replace("\n", "")
     sessions = arviz.from_netcdf(house / "history.nc")["sessions"]
     with Journal.read(house / "learned.db") as view:
-        weights = np.stack([r.weights for r in view.reports()])
+        weights = np.stack([r.weights for r in view.records()])
     np.testing.assert_array_equal(sessions["weights"].transpose("session", "feature"), weights)
     assert sessions["feature"].values.tolist() == ["goes on", "is north"]
 
@@ -337,13 +337,13 @@ def test_a_journal_of_several_rewards_and_other_reports_is_shown(tmp_path):
         weights: np.ndarray
         session: int
 
-    class Report(NamedTuple):
+    class SessionInfo(NamedTuple):
         log_likelihood: float
         components: np.ndarray
 
     learner = lme_i2rl(circle(), Visibility(IN_VIEW))
     with Journal.open(tmp_path / "two.db", learner) as journal:
-        journal.commit(State(np.array([[1.0, -2.0], [0.25, 0.0]]), 1), Report(-1.5, np.ones(2)))
+        journal.commit(State(np.array([[1.0, -2.0], [0.25, 0.0]]), 1), SessionInfo(-1.5, np.ones(2)))
     shown = call("show", tmp_path / "two.db").stdout
     assert re.search(r"goes on +│ +1.000 │ +0.333 │ +0.250 │ +1.000 │", shown)
     assert re.search(r"│ +1 │ +-1.5000 │", shown)

@@ -121,7 +121,7 @@ def test_a_session_is_one_update_with_its_trajectories(learner, lines, tmp_path)
     records = [r.demonstration for r in read_trajectories(lines, learner.mdp)]
     state = learner.init(KEY)
     with Journal.read(tmp_path / "j") as view:
-        stored = list(view.reports())
+        stored = list(view.records())
         final = view.stored_state()
     for i, report in enumerate(reports):
         state, expected = learner.update(state, concatenate(records[2 * i : 2 * i + 2]))

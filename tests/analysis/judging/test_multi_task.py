@@ -4,7 +4,7 @@ import jax
 import numpy as np
 import pytest
 
-from i2rl.analysis import assignment_accuracy, expected_value_difference, match_ways
+from i2rl.analysis import assignment_accuracy, expected_value_difference, match_components
 from i2rl.analysis.judging.multi_task import adjusted_rand_index
 from i2rl.domains import demonstrate_sorting, sorting_with_claiming
 from i2rl.models import Demonstration
@@ -39,9 +39,9 @@ def test_value_difference_is_the_definition_s():
     assignments = np.array([1, 0, 2, 0, 1])
     policies = [_best(mdp, w) for w in learned]
     total = 0.0
-    for i, (behaviour, way) in enumerate(zip(mixed.labels, assignments, strict=True)):
+    for i, (behaviour, component) in enumerate(zip(mixed.labels, assignments, strict=True)):
         best = _values(mdp, weights[behaviour], _best(mdp, weights[behaviour]))
-        here = _values(mdp, weights[behaviour], policies[way])
+        here = _values(mdp, weights[behaviour], policies[component])
         total += sum(abs(best[s] - here[s]) for s in mixed.demonstration.state[i])
     found = expected_value_difference(mdp, weights, mixed.labels, learned, assignments, mixed.demonstration)
     assert found == pytest.approx(total / 5, rel=1e-9)
@@ -97,7 +97,7 @@ def test_accuracy_is_the_best_of_all_matchings():
             for renamed in permutations(names)
         )
         assert assignment_accuracy(labels, assignments) == pytest.approx(best / 9)
-        matched = match_ways(labels, assignments)
+        matched = match_components(labels, assignments)
         assert len(set(matched.values())) == len(matched)
         hits = sum(matched.get(int(b)) == a for a, b in zip(assignments, labels, strict=True))
         assert hits == best
@@ -127,7 +127,7 @@ def test_adjusted_rand_index_is_zero_on_average_over_renumbered_trajectories():
 def test_a_way_without_a_behaviour_s_trajectories_is_not_that_behaviour():
     labels = np.array([0] * 6 + [1])
     assignments = np.array([0] * 5 + [1] + [0])
-    assert match_ways(labels, assignments) == {0: 0}
+    assert match_components(labels, assignments) == {0: 0}
 
 
 def test_partitions_must_fit():

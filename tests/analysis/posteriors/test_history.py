@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from i2rl.analysis.posteriors.history import fleet_history, provenance, run_history
-from i2rl.inference import Learner, Report, darko_i2rl, fleet, jin_i2rl, run_sessions
+from i2rl.inference import Learner, SessionInfo, darko_i2rl, fleet, jin_i2rl, run_sessions
 from i2rl.inference.sessions.statistic import CountStatistic, FeatureStatistic, blend
 from i2rl.models import TrajectoryLaw, sample_demonstration
 from i2rl.models.observation.evidence import Sensor
@@ -45,17 +45,17 @@ def learner(mdp):
         kept = blend(state.statistic, CountStatistic(jnp.array(float(n)), pairs / n))
         weights = jnp.einsum("sa,sak->k", kept.counts, mdp.features)
         number = state.session + 1
-        report = Report(number, -weights.sum(), -2 * weights.sum(), weights.max(), number, 3 * number,
+        info = SessionInfo(number, -weights.sum(), -2 * weights.sum(), weights.max(), number, 3 * number,
                         jnp.array(True), 0.1 * number, weights)  # fmt: skip
-        return State(kept, number), report
+        return State(kept, number), info
 
     def init(key):
         del key
         return State(CountStatistic(jnp.zeros(()), jnp.zeros((mdp.n_states, mdp.n_actions))), jnp.array(0))
 
     def update(state, demonstration):
-        state, report = jax.jit(session)(state, demonstration)
-        return state, Report(*(x.item() if np.ndim(x) == 0 else np.asarray(x) for x in report))
+        state, info = jax.jit(session)(state, demonstration)
+        return state, SessionInfo(*(x.item() if np.ndim(x) == 0 else np.asarray(x) for x in info))
 
     return Learner("counting", mdp, {"iterations": 3}, init, update, session)
 
@@ -83,16 +83,16 @@ def test_sessions_hold_every_field_of_the_reports(history, run, mdp):
     assert list(sessions.session) == [1, 2, 3]
     assert list(sessions.feature) == list(mdp.feature_names)
     assert sessions.weights.dims == ("session", "feature")
-    np.testing.assert_array_equal(sessions.weights, [r.weights for r in run.reports])
-    for name in set(run.reports[0]._fields) - {"session", "weights"}:
+    np.testing.assert_array_equal(sessions.weights, [r.weights for r in run.infos])
+    for name in set(run.infos[0]._fields) - {"session", "weights"}:
         assert sessions[name].dims == ("session",), name
-        np.testing.assert_array_equal(sessions[name], [getattr(r, name) for r in run.reports])
+        np.testing.assert_array_equal(sessions[name], [getattr(r, name) for r in run.infos])
     assert sessions.seconds.attrs["units"] == "s"
     np.testing.assert_array_equal(history.constant_data.true_weights, [2.0, -1.0])
 
 
 def test_the_policy_learned_is_that_of_the_last_weights(history, run, mdp, dense_transitions):
-    expected = soft_policy(mdp, dense_transitions(mdp), np.asarray(run.reports[-1].weights))
+    expected = soft_policy(mdp, dense_transitions(mdp), np.asarray(run.infos[-1].weights))
     np.testing.assert_allclose(history.learned.soft_policy, expected, atol=1e-8)
     assert list(history.learned.state.values) == list(mdp.state_names)
 
@@ -108,7 +108,7 @@ def test_the_statistic_learned_counts_the_demonstration(history, demonstration, 
 
 def test_a_feature_statistic_has_its_own_dimensions(learner, run):
     statistic = FeatureStatistic(jnp.array(3.0), jnp.arange(2.0), jnp.full(4, 0.25))
-    learned = run_history(learner, run.reports, statistic=statistic).learned
+    learned = run_history(learner, run.infos, statistic=statistic).learned
     assert learned.features.dims == ("feature",)
     assert learned.start.dims == ("state",)
     np.testing.assert_array_equal(learned.features, [0.0, 1.0])
@@ -142,11 +142,11 @@ def test_a_history_survives_a_file(history, tmp_path):
 
 
 def test_reports_alone_make_a_history_without_a_statistic(learner, run, history):
-    alone = run_history(learner, run.reports)
+    alone = run_history(learner, run.infos)
     assert alone.sessions.equals(history.sessions)
     assert set(alone.learned.data_vars) == {"weights", "soft_policy"}
     assert alone.groups() == ["sessions", "learned"]
-    given = run_history(learner, run.reports, statistic=run.state.statistic)
+    given = run_history(learner, run.infos, statistic=run.state.statistic)
     assert given.learned.equals(history.learned)
 
 
@@ -154,11 +154,11 @@ def test_a_fleet_has_the_history_of_each_of_its_streams(mdp, learner):
     law = TrajectoryLaw(mdp, jnp.array([2.0, -1.0]), Sensor(), 4)
     streams = [list(sample_demonstration(jax.random.key(i), law, 4).sessions(2)) for i in range(2)]
     many = fleet(learner)
-    states, reports = many.init(jax.random.key(5), 2), []
+    states, infos = many.init(jax.random.key(5), 2), []
     for session in zip(*streams, strict=True):
-        states, report = many.update(states, jax.tree.map(lambda *x: np.stack(x), *session))
-        reports.append(report)
-    history = fleet_history(learner, reports, state=states)
+        states, info = many.update(states, jax.tree.map(lambda *x: np.stack(x), *session))
+        infos.append(info)
+    history = fleet_history(learner, infos, state=states)
     assert history.sessions.weights.dims == ("run", "session", "feature")
     assert history.learned.counts.dims == ("run", "state", "action")
     assert history.learned["size"].dims == ("run",)
@@ -171,7 +171,7 @@ def test_a_fleet_has_the_history_of_each_of_its_streams(mdp, learner):
             one = history[group][name].isel(run=i)
             np.testing.assert_allclose(one, alone[group][name], rtol=1e-6, atol=1e-9)
     with pytest.raises(ValueError, match="use fleet_history"):
-        run_history(learner, reports)
+        run_history(learner, infos)
 
 
 def test_what_is_no_history_is_refused(learner, run):
@@ -180,10 +180,10 @@ def test_what_is_no_history_is_refused(learner, run):
     with pytest.raises(ValueError, match="a run or a list of reports, got int"):
         run_history(learner, [1, 2])
     with pytest.raises(ValueError, match="use run_history"):
-        fleet_history(learner, run.reports)
+        fleet_history(learner, run.infos)
     with pytest.raises(ValueError, match=r"true_weights must have shape \(2,\), got \(3,\)"):
         run_history(learner, run, true_weights=np.zeros(3))
-    wide = [report._replace(weights=np.zeros(5)) for report in run.reports]
+    wide = [info._replace(weights=np.zeros(5)) for info in run.infos]
     with pytest.raises(ValueError, match=r"must have shape \(2,\), one for each feature, got \(5,\)"):
         run_history(learner, wide)
 

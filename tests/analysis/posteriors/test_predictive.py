@@ -79,7 +79,7 @@ def mean_visits(mdp, moves, sensor, demonstration):
         for kind, state in zip(kinds, states, strict=True):
             if kind not in (PAD, LOST) and not (kind == SEEN and state == UNKNOWN):
                 for s, a in np.ndindex(*policy.shape):
-                    expected += place[s] * policy[s, a] * float(sensor.presence[s]) * reading[s, a]
+                    expected += place[s] * policy[s, a] * float(sensor.visibility[s]) * reading[s, a]
             place = place @ chain
     return expected
 

@@ -54,7 +54,7 @@ def stated_sorting(prediction: float, place: float) -> np.ndarray:
 
 
 def table_of(noise: SwapNoise | FeatureNoise) -> np.ndarray:
-    return np.exp(np.asarray(noise.reading.log_probabilities))
+    return np.exp(np.asarray(noise.noise.log_probabilities))
 
 
 # -- predicates ---------------------------------------------------------------------------------------
@@ -154,7 +154,7 @@ def test_noise_composes_with_a_view_and_passes_through_compilation() -> None:
     data = demonstrate_noisy(jax.random.key(0), task, sessions=10, view=view)
     plain = log_evidence(view * task.noise, data.mdp, data.seen)
     np.testing.assert_array_equal(log_evidence(task.noise * view, data.mdp, data.seen), plain)
-    compiled = jax.jit(lambda noise: noise.reading.log_probabilities)(task.noise)
+    compiled = jax.jit(lambda noise: noise.noise.log_probabilities)(task.noise)
     np.testing.assert_allclose(np.exp(compiled), table_of(task.noise), atol=1e-12)
 
 
@@ -332,7 +332,7 @@ def test_two_clarities_multiply() -> None:
 
 def test_scores_of_a_plain_observation_model_are_about_the_pair() -> None:
     task = sorting_task()
-    data = demonstrate_noisy(jax.random.key(10), task, task.noise.reading, sessions=MANY, scores="calibrated")
+    data = demonstrate_noisy(jax.random.key(10), task, task.noise.noise, sessions=MANY, scores="calibrated")
     right, score = flat(data.truth, 7) == flat(data.seen, 7), np.asarray(data.seen.score).reshape(-1)
     never_mistaken = ~np.asarray(task.noise.acts).reshape(2, -1).any(0)[flat(data.truth, 7)]
     np.testing.assert_allclose(score[never_mistaken], 1)

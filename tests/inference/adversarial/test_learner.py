@@ -12,7 +12,7 @@ from i2rl.inference.journal.journal import Journal, JournalError
 from i2rl.inference.sessions.running import run_sessions
 from i2rl.models.observation.recordings import Recording, RecordingError, recording
 
-SMALL = AdversarialTraining(rounds=3, updates=2, batch=32)
+SMALL = AdversarialTraining(iterations=3, updates=2, batch=32)
 
 
 @pytest.fixture(scope="module")
@@ -69,35 +69,35 @@ def test_a_run_resumed_from_its_journal_equals_an_uninterrupted_one_to_the_bit(
 
 def test_everything_is_carried_between_sessions(learner, demonstration):
     first, _ = learner.update(learner.init(jax.random.key(0)), demonstration)
-    second, report = learner.update(first, demonstration)
+    second, info = learner.update(first, demonstration)
     assert int(second.session) == 2
-    assert int(second.rounds) == 2 * SMALL.rounds
-    assert report.environment_steps == 2 * SMALL.rounds * 4 * 32
-    assert report.pairs == 4 * 40
+    assert int(second.iterations) == 2 * SMALL.iterations
+    assert info.environment_steps == 2 * SMALL.iterations * 4 * 32
+    assert info.pairs == 4 * 40
     adam = second.optimiser[0]
-    assert int(adam.count) == 2 * SMALL.rounds * SMALL.updates
-    assert int(second.generator.updates) == 2 * SMALL.rounds
+    assert int(adam.count) == 2 * SMALL.iterations * SMALL.updates
+    assert int(second.generator.updates) == 2 * SMALL.iterations
 
 
 def test_reports_are_plain_numbers_of_what_happened(learner, demonstration):
-    _, report = learner.update(learner.init(jax.random.key(0)), demonstration)
-    assert report.loss.shape == report.returns.shape == (SMALL.rounds,)
-    assert ((report.expert_accuracy >= 0) & (report.expert_accuracy <= 1)).all()
+    _, info = learner.update(learner.init(jax.random.key(0)), demonstration)
+    assert info.loss.shape == info.returns.shape == (SMALL.iterations,)
+    assert ((info.expert_accuracy >= 0) & (info.expert_accuracy <= 1)).all()
     # A fresh categorical policy is nearly uniform over two actions.
-    assert report.log_likelihood == pytest.approx(np.log(0.5), abs=0.1)
-    assert np.isfinite(report.weights).all()
+    assert info.log_likelihood == pytest.approx(np.log(0.5), abs=0.1)
+    assert np.isfinite(info.weights).all()
 
 
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [
-        ({"rounds": 0}, "rounds"),
+        ({"iterations": 0}, "iterations"),
         ({"batch": 0}, "batch"),
         ({"average": "median"}, "average"),
         ({"learning_rate": float("nan")}, "learning_rate"),
         ({"penalty": -1.0}, "penalty"),
         ({"change": float("nan")}, "change"),
-        ({"samplings": 0}, "samplings"),
+        ({"draws": 0}, "draws"),
     ],
 )
 def test_training_that_cannot_be_is_refused_by_name(generator, task, wrong, named):
@@ -184,10 +184,10 @@ def test_the_pole_is_balanced_by_imitation_alone(task, kind):
         assert not ended
     demonstration = recording([np.array(observations)], [np.array(actions)], n_actions=2)
     agent = ppo(task, n_envs=8, n_steps=128, learning_rate=1e-3, scale_rewards=True)
-    training = AdversarialTraining(rounds=48, updates=16, learning_rate=3e-3)
+    training = AdversarialTraining(iterations=48, updates=16, learning_rate=3e-3)
     learner = adversarial("x", agent, kind(4, task.actions), training=training)
-    state, report = learner.update(learner.init(jax.random.key(0)), demonstration)
-    random = report.returns[0]
+    state, info = learner.update(learner.init(jax.random.key(0)), demonstration)
+    random = info.returns[0]
     learned = agent.evaluate(state.generator.policy, jax.random.key(1), 10).returns.mean()
     assert random < 40
     assert learned > 200

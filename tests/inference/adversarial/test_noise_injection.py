@@ -186,7 +186,7 @@ def test_weighted_steps_count_as_often_as_their_weight_says(classified):
 
 # -- the learner ------------------------------------------------------------------------------------------
 
-TRAINING = NoisyTraining(rounds=12, updates=16, batch=128, learning_rate=3e-3, replay=5)
+TRAINING = NoisyTraining(iterations=12, updates=16, batch=128, learning_rate=3e-3, replay=5)
 
 
 @pytest.fixture(scope="module")
@@ -245,23 +245,23 @@ def test_a_run_resumed_from_its_journal_equals_an_uninterrupted_one_to_the_bit(
 
 
 def test_everything_is_carried_between_sessions(sessions):
-    state, report = sessions[-1]
-    assert int(state.session) == report.session == 3
-    assert int(state.rounds) == 3 * 12
-    assert int(state.pairs) == report.pairs == 900
+    state, info = sessions[-1]
+    assert int(state.session) == info.session == 3
+    assert int(state.iterations) == 3 * 12
+    assert int(state.pairs) == info.pairs == 900
     assert int(state.optimiser[0].count) == 3 * 12 * 16
     assert int(state.generator.updates) == 3 * 12
-    assert report.environment_steps == 3 * 12 * 1280
+    assert info.environment_steps == 3 * 12 * 1280
 
 
 def test_reports_are_plain_numbers_of_what_happened(demonstration, sessions):
-    state, report = sessions[0]
-    assert report.loss.shape == report.returns.shape == (12,)
+    state, info = sessions[0]
+    assert info.loss.shape == info.returns.shape == (12,)
     # Of 300 steps the last has no known successor.
     policy, observations = state.generator.policy, demonstration.observations[0, :-1]
     each = policy.log_prob(observations, demonstration.actions[0, :-1])
-    assert report.log_likelihood == pytest.approx(float(each.mean()), rel=1e-5)
-    assert np.isfinite(report.weights).all()
+    assert info.log_likelihood == pytest.approx(float(each.mean()), rel=1e-5)
+    assert np.isfinite(info.weights).all()
 
 
 def test_the_pole_is_balanced_by_imitation_despite_the_noise(agent, sessions):
@@ -280,15 +280,15 @@ def test_the_host_is_acted_in_as_well_and_the_discriminator_sees_actions_within_
         inside = jnp.all((a >= jnp.array(BOX.low)) & (a <= jnp.array(BOX.high)), -1)
         return jnp.where(inside, discriminator.score(network, z, a, following, terminated), jnp.nan)
 
-    training = NoisyTraining(rounds=2, updates=2, replay=1, levels=(0.0, 0.3), shown="executed")
+    training = NoisyTraining(iterations=2, updates=2, replay=1, levels=(0.0, 0.3), shown="executed")
     learner = noisy_airl(agent, discriminator._replace(score=guarded), training)
     rng = np.random.default_rng(0)
     demonstration = recording([rng.normal(size=(9, 2))], [rng.uniform(-1, 0.5, (9, 2))])
-    one, report = learner.update(learner.init(jax.random.key(0)), demonstration)
+    one, info = learner.update(learner.init(jax.random.key(0)), demonstration)
     other, _ = learner.update(learner.init(jax.random.key(0)), demonstration)
     assert same(one, other)
-    assert np.isfinite(report.returns).all()
-    assert np.isfinite(report.loss).all()
+    assert np.isfinite(info.returns).all()
+    assert np.isfinite(info.loss).all()
     with Journal.open(tmp_path / "host.journal", learner) as journal:
         run_sessions(learner, [demonstration], key=jax.random.key(0), journal=journal)
         assert same(journal.state, one)
@@ -297,7 +297,7 @@ def test_the_host_is_acted_in_as_well_and_the_discriminator_sees_actions_within_
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [
-        ({"rounds": 0}, "rounds"),
+        ({"iterations": 0}, "iterations"),
         ({"shown": "both"}, "intended, executed"),
         ({"levels": (0.0, 1.0)}, "noise level 1"),
         ({"levels": (0.0, 0.1, 0.2)}, "3 noise levels"),

@@ -82,7 +82,7 @@ def generator(task):
     return ppo(task, n_envs=4, n_steps=32, minibatch=64, epochs=2, hidden=(16,))
 
 
-TRAINING = AdversarialTraining(rounds=3, updates=2, batch=32, refresh=2)
+TRAINING = AdversarialTraining(iterations=3, updates=2, batch=32, refresh=2)
 
 
 def test_draws_become_samples_of_the_same_steps(demonstration):
@@ -270,11 +270,11 @@ def test_a_look_samples_on_until_the_average_logit_settles(generator, truth, sen
         return learner.update(learner.init(jax.random.key(0)), reports)
 
     _, once = session()
-    state, strict = session(change=0.002, samplings=12)
-    _, loose = session(change=0.2, samplings=12)
-    assert once.samplings.tolist() == [1, 1]  # of three rounds, the first and the third look
-    assert (strict.samplings > loose.samplings).all()
-    assert (loose.samplings >= 2).all()
+    state, strict = session(change=0.002, draws=12)
+    _, loose = session(change=0.2, draws=12)
+    assert once.draws.tolist() == [1, 1]  # of three rounds, the first and the third look
+    assert (strict.draws > loose.draws).all()
+    assert (loose.draws >= 2).all()
     assert np.isfinite(state.weights).all()
 
 

@@ -218,8 +218,8 @@ def learner(agent):
     return ssrr(
         agent,
         airl_discriminator(2, PUSH, state_only=True),
-        NoisyTraining(rounds=30, updates=16, batch=128, learning_rate=3e-3, replay=5),
-        SSRRTraining(regression=regression, rounds=40),
+        NoisyTraining(iterations=30, updates=16, batch=128, learning_rate=3e-3, replay=5),
+        SSRRTraining(regression=regression, iterations=40),
     )
 
 
@@ -231,26 +231,26 @@ def sessions(learner, demonstration):
 
 
 def test_noise_teaches_what_is_better_than_what_was_shown(agent, sessions, demonstration):
-    state, report = sessions[0]
+    state, info = sessions[0]
     shown = np.asarray(demonstration.observations)[..., 0].sum(1).mean()
     imitated = agent.evaluate(state.first.generator.policy, jax.random.key(1), 10).returns.mean()
     learned = agent.evaluate(state.generator.policy, jax.random.key(1), 10).returns.mean()
     assert imitated == pytest.approx(shown, rel=0.3)
     assert learned > 1.5 * shown
-    assert report.curve.explained > 0.5
+    assert info.curve.explained > 0.5
     line = np.stack([np.linspace(-1, 1, 21), np.zeros(21)], 1)
     assert np.corrcoef(state.network(line), line[:, 0])[0, 1] > 0.9
 
 
 def test_everything_is_carried_between_sessions(sessions):
-    state, report = sessions[-1]
-    assert int(state.session) == int(state.first.session) == report.session == 2
+    state, info = sessions[-1]
+    assert int(state.session) == int(state.first.session) == info.session == 2
     assert (state.optimiser[0].count == 2 * 500).all()
     assert int(state.generator.updates) == 2 * 40
     assert int(state.first.generator.updates) == 2 * 30
-    assert report.pairs == 2 * 240
-    assert report.environment_steps == 2 * ((30 + 40) * 800 + 20 * 5 * 40)
-    assert report.returns.shape == (40,)
+    assert info.pairs == 2 * 240
+    assert info.environment_steps == 2 * ((30 + 40) * 800 + 20 * 5 * 40)
+    assert info.returns.shape == (40,)
     # The ensemble's statistic of inputs holds the ranked states of both sessions.
     assert float(state.network.norm.count) == 2 * 20 * 5 * 40
 
@@ -276,11 +276,11 @@ def test_the_second_policy_may_begin_as_the_first(agent, demonstration):
     still = agent._replace(improve=lambda state, rollout, rewards: state)
     training = SSRRTraining(
         regression=Regression(hidden=(), members=1, snippets=80, iterations=1, shortest=5, longest=30),
-        rounds=1,
+        iterations=1,
         start="first",
     )
     learner = ssrr(
-        still, airl_discriminator(2, PUSH, state_only=True), NoisyTraining(rounds=1, updates=1), training
+        still, airl_discriminator(2, PUSH, state_only=True), NoisyTraining(iterations=1, updates=1), training
     )
     before = learner.init(jax.random.key(0))
     after, _ = learner.update(before, demonstration)
@@ -292,7 +292,7 @@ def test_the_second_policy_may_begin_as_the_first(agent, demonstration):
 @pytest.mark.parametrize(
     ("wrong", "named"),
     [
-        ({"rounds": 0}, "rounds"),
+        ({"iterations": 0}, "iterations"),
         ({"trajectories": 0}, "trajectories"),
         ({"levels": (0.0, 0.5)}, "four levels"),
         ({"average": "mode"}, "mean, median"),

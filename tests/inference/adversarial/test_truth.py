@@ -44,47 +44,47 @@ def test_reported_steps_are_those_with_a_successor_or_a_termination():
 
 
 def test_without_a_threshold_the_truth_is_sampled_once():
-    chain, expert, samplings = looked(np.inf, 20)
-    assert chain == samplings == 1
+    chain, expert, draws = looked(np.inf, 20)
+    assert chain == draws == 1
     assert expert.steps.observations.shape == (N, M, 1)
 
 
 @pytest.mark.parametrize("change", [0.05, 0.02])
 def test_the_truth_is_sampled_until_the_average_logit_settles(change):
-    _, expert, samplings = looked(change, 200)
-    assert 2 < samplings < 200
-    drawn = np.asarray(logits(expert.steps))[:, : samplings * M].reshape(N, samplings, M).mean(-1)
-    averages = np.cumsum(drawn, 1) / np.arange(1, samplings + 1)
+    _, expert, draws = looked(change, 200)
+    assert 2 < draws < 200
+    drawn = np.asarray(logits(expert.steps))[:, : draws * M].reshape(N, draws, M).mean(-1)
+    averages = np.cumsum(drawn, 1) / np.arange(1, draws + 1)
     moves = np.abs(np.diff(averages, axis=1))[LIVE].mean(0)
     assert moves[-1] <= change < moves[:-1].min()
 
 
 def test_moves_are_counted_for_each_logit_however_many_there_are():
     # A mean of n standard normal pairs moves by about |N(0, 1/2)| / n when one is added: .56 / n.
-    _, _, samplings = looked(0.02, 200)
-    assert samplings == pytest.approx(0.56 / 0.02, rel=0.25)
+    _, _, draws = looked(0.02, 200)
+    assert draws == pytest.approx(0.56 / 0.02, rel=0.25)
 
 
 def test_samples_that_were_not_drawn_weigh_nothing():
-    _, expert, samplings = looked(0.05, 60)
+    _, expert, draws = looked(0.05, 60)
     assert expert.steps.observations.shape == (N, 60 * M, 1)
     drawn = np.asarray(expert.weights) > 0
-    np.testing.assert_array_equal(drawn, np.arange(60 * M) < samplings * M)
+    np.testing.assert_array_equal(drawn, np.arange(60 * M) < draws * M)
     assert float(expert.weights.sum()) == pytest.approx(1)
     average = np.asarray(logits(expert.steps) @ expert.weights)
     np.testing.assert_allclose(average, logits(expert.steps)[:, drawn].mean(1), rtol=1e-5, atol=1e-7)
 
 
 def test_at_most_so_many_samplings_are_made():
-    chain, expert, samplings = looked(0.0, 7)
-    assert chain == samplings == 7
+    chain, expert, draws = looked(0.0, 7)
+    assert chain == draws == 7
     np.testing.assert_allclose(expert.weights, 1 / (7 * M), rtol=1e-6)
 
 
 def test_reports_at_face_value_settle_at_once():
     rec = recording([np.arange(5.0)[:, None]], [np.zeros(5, int)])
     found = look(FaceValue(), rec, (), None, KEY, ActionSpace(1), logits, 1e-9, 20)
-    assert found.samplings == 2
+    assert found.draws == 2
 
 
 def test_actions_are_cut_to_their_bounds():

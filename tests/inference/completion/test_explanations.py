@@ -82,7 +82,7 @@ def test_an_unavailable_action_cannot_have_happened(mdp, policies, demonstration
 
 
 def test_without_a_reward_every_available_action_is_as_likely(mdp, demonstration):
-    jumble = seen_whole(mdp, Sensor(), demonstration)
+    trajectories = seen_whole(mdp, Sensor(), demonstration)
     choices = np.asarray(mdp.available).sum(1)
-    expected = jumble.constant - np.einsum("nsa,s->n", np.asarray(jumble.visits), np.log(choices))
-    np.testing.assert_allclose(without_reward(mdp, jumble).log_likelihood, expected, atol=1e-10)
+    expected = trajectories.constant - np.einsum("nsa,s->n", np.asarray(trajectories.visits), np.log(choices))
+    np.testing.assert_allclose(without_reward(mdp, trajectories).log_likelihood, expected, atol=1e-10)

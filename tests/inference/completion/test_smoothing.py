@@ -313,14 +313,14 @@ def test_relabelling_states_relabels_the_posterior(
         initial=np.asarray(mdp.initial)[order],
         discount=0.9,
     )
-    log_policy, presence = random_log_policy(seed, mdp), np.random.default_rng(seed).random(S)
-    demonstration = imperfect_demonstration(seed, mdp, log_policy, Visibility(presence), 2, LENGTH)
+    log_policy, visibility = random_log_policy(seed, mdp), np.random.default_rng(seed).random(S)
+    demonstration = imperfect_demonstration(seed, mdp, log_policy, Visibility(visibility), 2, LENGTH)
     state = np.where(demonstration.state == UNKNOWN, UNKNOWN, place[demonstration.state])
-    here = exact(mdp, log_policy, evidence_of(mdp, Visibility(presence), demonstration))
+    here = exact(mdp, log_policy, evidence_of(mdp, Visibility(visibility), demonstration))
     there = exact(
         moved,
         log_policy[order],
-        evidence_of(moved, Visibility(presence[order]), demonstration._replace(state=state)),
+        evidence_of(moved, Visibility(visibility[order]), demonstration._replace(state=state)),
     )
     np.testing.assert_allclose(there.log_likelihood, here.log_likelihood, atol=1e-10)
     np.testing.assert_allclose(there.counts, np.asarray(here.counts)[order], atol=1e-10)

@@ -50,7 +50,7 @@ class State(NamedTuple):
     key: Any
 
 
-class Report(NamedTuple):
+class SessionInfo(NamedTuple):
     log_likelihood: Any
     gap: Any
     status: str
@@ -76,13 +76,13 @@ class Toy(NamedTuple):
         k = self.mdp.n_features
         return State(jnp.zeros(k), Statistic(jnp.zeros(k), 0.0), jnp.zeros((0, k)), 0, key)
 
-    def update(self, state: State, counts: Any) -> tuple[State, Report]:
+    def update(self, state: State, counts: Any) -> tuple[State, SessionInfo]:
         key, noise = jax.random.split(state.key)
         weights = state.weights + self.step * (counts + jax.random.normal(noise, state.weights.shape))
         statistic = Statistic(state.statistic.counts + counts, state.statistic.total + 1 / 3)
         session = state.session + 1
         found = None if session == 1 else np.arange(session)
-        report = Report(-weights.sum(), weights**2, "converged", found)
+        report = SessionInfo(-weights.sum(), weights**2, "converged", found)
         return State(weights, statistic, jnp.outer(weights, weights), session, key), report
 
 
@@ -97,7 +97,7 @@ def learner() -> Toy:
     return Toy(process(feature_names=["near", "far"]))
 
 
-def learned(learner: Toy, sessions: int, state: State | None = None) -> list[tuple[State, Report]]:
+def learned(learner: Toy, sessions: int, state: State | None = None) -> list[tuple[State, SessionInfo]]:
     state = learner.init(jax.random.key(7)) if state is None else state
     history = []
     for _ in range(sessions):
@@ -265,10 +265,10 @@ def test_a_learner_that_stops_and_resumes_learns_the_same_to_the_bit(learner: To
     with Journal.open(tmp_path / "j", learner) as journal:
         assert bits(journal.state) == bits(whole[-1][0])
         assert journal.session == 6
-        for (state, report), record in zip(whole, journal.reports(), strict=True):
+        for (state, report), record in zip(whole, journal.records(), strict=True):
             assert record.session == state.session
             assert bits(record.weights) == bits(np.asarray(state.weights))
-            assert list(record.report) == list(Report._fields)
+            assert list(record.report) == list(SessionInfo._fields)
             for name, value in report._asdict().items():
                 np.testing.assert_array_equal(record.report[name], value)
 
@@ -277,7 +277,7 @@ def test_the_first_state_comes_from_the_learner(learner: Toy, tmp_path: Path) ->
     with Journal.open(tmp_path / "j", learner) as journal:
         assert journal.state is None
         assert (journal.session, journal.position) == (0, Position())
-        assert list(journal.reports()) == []
+        assert list(journal.records()) == []
         assert journal.stored_state() == {}
 
 
@@ -288,7 +288,7 @@ def test_a_session_is_not_committed_twice(learner: Toy, tmp_path: Path) -> None:
         for state in (first, second):
             with pytest.raises(ValueError, match=f"session {state.session} is already committed"):
                 journal.commit(state, report)
-        assert [record.session for record in journal.reports()] == [2]
+        assert [record.session for record in journal.records()] == [2]
 
 
 def test_the_position_is_committed_with_the_session(learner: Toy, tmp_path: Path) -> None:
@@ -300,7 +300,7 @@ def test_the_position_is_committed_with_the_session(learner: Toy, tmp_path: Path
             journal.commit(state, report, position)
         (last, report) = learned(learner, 1, journal.state)[0]
         journal.commit(last, report)
-        assert [record.position.records for record in journal.reports()] == [1, 2, 3, 3]
+        assert [record.position.records for record in journal.records()] == [1, 2, 3, 3]
     with Journal.open(tmp_path / "j", learner) as journal:
         assert journal.position == position
         assert journal.position_after(1) == Position().after("one")
@@ -445,7 +445,7 @@ def test_a_view_sees_sessions_as_they_are_committed(learner: Toy, tmp_path: Path
     with Journal.open(tmp_path / "j", learner) as journal, Journal.read(tmp_path / "j") as view:
         assert view.session == 0
         for state, report in history:
-            reading = view.reports()
+            reading = view.records()
             journal.commit(state, report, Position().after("line"))
             assert len(list(reading)) == view.session == state.session
             assert view.position == journal.position
@@ -549,7 +549,7 @@ def test_a_reader_beside_a_writer_never_meets_half_a_page(tmp_path: Path) -> Non
     for _ in range(150):
         with Journal.read(tmp_path / "j") as view:
             seen.append(view.session)
-            assert all(record.report["square"] == record.session**2 for record in view.reports(last=2))
+            assert all(record.report["square"] == record.session**2 for record in view.records(last=2))
     (tmp_path / "j-enough").touch()
     _, errors = writer.communicate(timeout=60)
     assert writer.returncode == 0, errors
@@ -743,8 +743,8 @@ def test_a_wrong_history_is_not_shown_as_true(
 ) -> None:
     damaged(twelve, *statement.split("; "))
     with Journal.read(twelve) as view:
-        assert [record.session for record in view.reports(last=3)] == [10, 11, 12]  # nothing else is read
-        for refused in (lambda: list(view.reports()), view.verify, view.to_inference_data):
+        assert [record.session for record in view.records(last=3)] == [10, 11, 12]  # nothing else is read
+        for refused in (lambda: list(view.records()), view.verify, view.to_inference_data):
             with pytest.raises(JournalError, match=message):
                 refused()
     with pytest.raises(JournalError, match=message):
@@ -755,7 +755,7 @@ def test_a_flipped_bit_and_swapped_rows_are_noticed(twelve: Path) -> None:
     whole = twelve.read_bytes()
     with Journal.read(twelve) as view:
         assert view.verify() == 12
-        weights = list(view.reports())[4].weights.tobytes()
+        weights = list(view.records())[4].weights.tobytes()
     at = whole.index(weights)
     twelve.write_bytes(whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :])
     with (
@@ -782,7 +782,7 @@ def test_a_damaged_state_is_not_learned_on_from(
 ) -> None:
     damaged(twelve, statement)
     with Journal.read(twelve) as view:
-        assert len(list(view.reports())) == 12
+        assert len(list(view.records())) == 12
         with pytest.raises(JournalError, match=message):
             view.stored_state()
     with pytest.raises(JournalError, match=message):
@@ -874,7 +874,7 @@ PRAGMA user_version=1;
 """
 
 
-def version_1(path: Path, learner: Toy, sessions: int) -> list[tuple[State, Report]]:
+def version_1(path: Path, learner: Toy, sessions: int) -> list[tuple[State, SessionInfo]]:
     """A journal as version 1 wrote it."""
     history = learned(learner, sessions)
     connection = sqlite3.connect(path)
@@ -892,14 +892,14 @@ def version_1(path: Path, learner: Toy, sessions: int) -> list[tuple[State, Repo
 def test_a_journal_of_version_1_is_shown_and_goes_on(learner: Toy, tmp_path: Path) -> None:
     history = version_1(tmp_path / "j", learner, 5)
     with Journal.read(tmp_path / "j") as view:
-        shown = list(view.reports())
+        shown = list(view.records())
         assert (view.session, view.sessions, view.position) == (5, 5, Position(5, "00"))
     with Journal.open(tmp_path / "j", learner) as journal:
         assert bits(journal.state) == bits(history[-1][0])
         journal.commit(*learned(learner, 1, journal.state)[0])
     with Journal.read(tmp_path / "j") as view:
         assert view.verify() == 6
-        for old, new in zip(shown, view.reports(), strict=False):
+        for old, new in zip(shown, view.records(), strict=False):
             assert bits(old.weights) == bits(new.weights)
             assert old.position == new.position
     damaged(tmp_path / "j", "UPDATE session SET records = 7 WHERE number = 2")
@@ -945,7 +945,7 @@ def test_a_full_disk_keeps_what_was_committed_and_the_learner_may_go_on(tmp_path
                 except JournalError as error:
                     print(error)
                 assert journal.session == 3 and journal.position == position(3)
-                assert [record.session for record in journal.reports()] == [1, 2, 3]
+                assert [record.session for record in journal.records()] == [1, 2, 3]
         resource.setrlimit(resource.RLIMIT_FSIZE, (-1, -1))
         journal.commit(after(5), Report(25), position(5))
         os._exit(0)  # without closing
@@ -957,7 +957,7 @@ def test_a_full_disk_keeps_what_was_committed_and_the_learner_may_go_on(tmp_path
     message = rf"{tmp_path / 'j'} cannot take session [45] \(what was committed up to session 3 is safe\): .*"
     assert len(re.findall(message, output)) == 6
     with Journal.read(tmp_path / "j") as view:
-        assert [record.session for record in view.reports()] == [1, 2, 3, 5]
+        assert [record.session for record in view.records()] == [1, 2, 3, 5]
         np.testing.assert_array_equal(view.stored_state()["statistic"], np.arange(3000.0) + 5)
 
 
@@ -986,10 +986,10 @@ def test_a_commit_that_fails_half_way_leaves_nothing(learner: Toy, tmp_path: Pat
         with pytest.raises(JournalError, match=r"cannot take session 2 .*: broken"):
             journal.commit(*history[1])
         assert journal.session == 1
-        assert [record.session for record in journal.reports()] == [1]
+        assert [record.session for record in journal.records()] == [1]
         journal._connection.execute("DROP TRIGGER broken")
         journal.commit(*history[1])
-        assert [record.session for record in journal.reports()] == [1, 2]
+        assert [record.session for record in journal.records()] == [1, 2]
 
 
 def test_a_killed_writer_loses_no_session_and_repeats_none(tmp_path: Path) -> None:
@@ -1001,9 +1001,9 @@ def test_a_killed_writer_loses_no_session_and_repeats_none(tmp_path: Path) -> No
             with Journal.open(path, learner) as journal:
                 n = journal.session
                 assert journal.position == position(n), (n, journal.position)
-                assert [record.session for record in journal.reports()] == list(range(1, n + 1))
-                assert all(r.report == {"square": r.session**2} for r in journal.reports())
-                assert all((r.weights == np.arange(2.0) * r.session).all() for r in journal.reports())
+                assert [record.session for record in journal.records()] == list(range(1, n + 1))
+                assert all(r.report == {"square": r.session**2} for r in journal.records())
+                assert all((r.weights == np.arange(2.0) * r.session).all() for r in journal.records())
                 stored = journal.stored_state()
                 if n:
                     assert stored["session"] == n and (stored["statistic"] == np.arange(3000.0) + n).all()
@@ -1066,7 +1066,7 @@ def test_a_log_cut_anywhere_leaves_whole_sessions(seed: int, learner: Toy, tmp_p
         cut_path.with_name("j-wal").write_bytes(log[:cut] + rng.bytes(rng.integers(0, 5000)))
         with Journal.open(cut_path, learner) as journal:
             n = journal.session
-            assert [record.session for record in journal.reports()] == list(range(1, n + 1))
+            assert [record.session for record in journal.records()] == list(range(1, n + 1))
             assert journal.position.records == n
             assert bits(journal.state) == (bits(history[n - 1][0]) if n else bits(None))
         reached.add(n)
@@ -1230,4 +1230,4 @@ def test_paths_that_lead_nowhere_and_what_is_no_learner_are_told(learner: Toy, t
     with Journal.read(tmp_path / "j") as view:
         for last in (0, -1, "3", 10**30):
             with pytest.raises(ValueError, match="positive number of sessions"):
-                list(view.reports(last))
+                list(view.records(last))

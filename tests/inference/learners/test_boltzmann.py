@@ -57,14 +57,17 @@ def test_gradient_against_finite_differences(mdp):
 
     @jax.jit
     @jax.value_and_grad
-    def total(weights, eta):
-        return jnp.sum(boltzmann_log_likelihoods(mdp, weights, counts, eta) * jnp.array([1.0, 2.5]))
+    def total(weights, rationality):
+        return jnp.sum(boltzmann_log_likelihoods(mdp, weights, counts, rationality) * jnp.array([1.0, 2.5]))
 
     for weights in rng.uniform(-1, 1, (5, 3)):
-        for eta in (0.5, 10.0):
+        for rationality in (0.5, 10.0):
             steps = 1e-6 * np.eye(3)
-            numeric = [(total(weights + h, eta)[0] - total(weights - h, eta)[0]) / 2e-6 for h in steps]
-            np.testing.assert_allclose(total(weights, eta)[1], numeric, rtol=1e-5, atol=1e-5)
+            numeric = [
+                (total(weights + h, rationality)[0] - total(weights - h, rationality)[0]) / 2e-6
+                for h in steps
+            ]
+            np.testing.assert_allclose(total(weights, rationality)[1], numeric, rtol=1e-5, atol=1e-5)
 
 
 def test_gradient_is_finite_where_an_action_is_the_only_one(random_mdp):

@@ -77,12 +77,12 @@ def test_the_margin_is_the_gradient_of_me_i2rls_program_for_the_session_alone(wo
     forgetful = me_i2rl(world, statistic="features", slack=0.0)
     state = forgetful.init(jax.random.key(0))._replace(weights=weights)
     assert float(state.statistic.size) == 0
-    _, report = forgetful.update(state, session)
-    assert report.gradient == pytest.approx(float(jnp.linalg.norm(found.margin)))
-    rate = 0.01
-    learner = darko_i2rl(world, learning_rate=rate)
+    _, info = forgetful.update(state, session)
+    assert info.gradient == pytest.approx(float(jnp.linalg.norm(found.margin)))
+    learning_rate = 0.01
+    learner = darko_i2rl(world, learning_rate=learning_rate)
     moved, _ = learner.update(learner.init(jax.random.key(0))._replace(weights=weights), session)
-    assert np.allclose((weights - moved.weights) / rate, found.margin, atol=1e-9)
+    assert np.allclose((weights - moved.weights) / learning_rate, found.margin, atol=1e-9)
 
 
 def test_one_session_learned_to_the_end_solves_me_i2rls_program(random_mdp):
@@ -93,10 +93,10 @@ def test_one_session_learned_to_the_end_solves_me_i2rls_program(random_mdp):
     target = feature_margin(mdp, jnp.zeros(2), session).statistic
     solution = solve_dual(mdp, FeatureTarget(target.features, target.start))
     learner = darko_i2rl(mdp, learning_rate=0.5, decay=0.0, steps=800)
-    state, report = learner.update(learner.init(jax.random.key(0)), session)
+    state, info = learner.update(learner.init(jax.random.key(0)), session)
     assert np.allclose(state.weights, solution.weights, atol=1e-6)
     assert float(jnp.linalg.norm(feature_margin(mdp, state.weights, session).margin)) < 1e-6
-    assert report.log_likelihood == pytest.approx(-float(solution.objective))
+    assert info.log_likelihood == pytest.approx(-float(solution.objective))
 
 
 def test_nothing_of_earlier_sessions_is_kept_but_the_weights(world):
@@ -147,14 +147,14 @@ def test_a_fleet_learns_what_its_members_would_and_nothing_from_the_impossible(w
     stacked = Demonstration(
         *(np.stack(parts) for parts in zip(*sessions, impossible_pair(world), strict=True))
     )
-    after, reports = many.update(states, stacked)
+    after, infos = many.update(states, stacked)
     for i, session in enumerate(sessions):
-        state, report = learner.update(jax.tree.map(operator.itemgetter(i), states), session)
+        state, info = learner.update(jax.tree.map(operator.itemgetter(i), states), session)
         assert np.allclose(after.weights[i], state.weights, atol=1e-9)
-        assert reports.log_likelihood[i] == pytest.approx(report.log_likelihood)
+        assert infos.log_likelihood[i] == pytest.approx(info.log_likelihood)
     assert after.session.tolist() == [1, 1, 0]
     assert np.array_equal(after.weights[2], states.weights[2])
-    assert np.isneginf(reports.demonstration_log_likelihood[2])
+    assert np.isneginf(infos.demonstration_log_likelihood[2])
 
 
 def test_an_impossible_observation_is_refused(world):

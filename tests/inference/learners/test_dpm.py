@@ -38,16 +38,16 @@ def demonstrate(mdp):
 
 
 @pytest.fixture(scope="module")
-def jumble(demonstrate):
+def trajectories(demonstrate):
     return concatenate([demonstrate(0, 0.9).select([0, 1]), demonstrate(1, -0.9).select([0, 1])])
 
 
 @pytest.fixture(scope="module")
-def long_run(mdp, jumble):
+def long_run(mdp, trajectories):
     """Many sweeps of the sampler with moves wide enough to bounce off the box's walls."""
     return dpm_birl(
-        mdp, eta=ETA, alpha=ALPHA, sweeps=8_000, proposals=1, updates=1, sigma=0.4
-    ).sample(jax.random.key(0), jumble)  # fmt: skip
+        mdp, rationality=ETA, alpha=ALPHA, iterations=8_000, proposals=1, updates=1, sigma=0.4
+    ).sample(jax.random.key(0), trajectories)  # fmt: skip
 
 
 def partitions(n):
@@ -73,10 +73,10 @@ def frequencies(trace, n, burn_in=500):
 
 
 @pytest.fixture(scope="module")
-def enumerated(mdp, jumble):
+def enumerated(mdp, trajectories):
     """Probability of each partition, and the posterior mean of each trajectory's weight, by quadrature."""
     axis = np.linspace(-1, 1, 801)
-    counts = jnp.asarray(visit_counts(mdp, jumble))
+    counts = jnp.asarray(visit_counts(mdp, trajectories))
     table = np.asarray(
         jax.jit(
             lambda: jax.lax.map(
@@ -119,9 +119,9 @@ def test_density_of_a_reflected_move(mean):
     np.testing.assert_allclose((moves <= 0.5).mean(), below, atol=0.005)
 
 
-def test_without_data_the_partition_follows_its_prior(mdp, jumble):
-    blind = dpm_birl(mdp, eta=1e-12, alpha=ALPHA, sweeps=8_000, proposals=1, updates=1, sigma=0.4)
-    trace = blind.sample(jax.random.key(1), jumble)
+def test_without_data_the_partition_follows_its_prior(mdp, trajectories):
+    blind = dpm_birl(mdp, rationality=1e-12, alpha=ALPHA, iterations=8_000, proposals=1, updates=1, sigma=0.4)
+    trace = blind.sample(jax.random.key(1), trajectories)
     prior = np.exp([log_seating(p, ALPHA) for p in partitions(4)])
     np.testing.assert_allclose(frequencies(trace, 4), prior, atol=0.02)
     # Nor do the moves off the walls distort the uniform prior of the weights.
@@ -141,8 +141,8 @@ def test_weights_follow_the_posterior(long_run, enumerated):
     np.testing.assert_allclose(long_run.weights[500:, :, 0].mean(0), means, atol=0.04)
 
 
-def test_the_joint_density_is_that_of_the_model(mdp, jumble, long_run):
-    counts = jnp.asarray(visit_counts(mdp, jumble))
+def test_the_joint_density_is_that_of_the_model(mdp, trajectories, long_run):
+    counts = jnp.asarray(visit_counts(mdp, trajectories))
     each = jax.jit(lambda w: jnp.diagonal(jax.vmap(
         lambda x: boltzmann_log_likelihoods(mdp, x, counts, ETA))(w)))  # fmt: skip
     for sweep in (0, 17, 5000):
@@ -158,18 +158,18 @@ def test_the_joint_density_is_that_of_the_model(mdp, jumble, long_run):
 
 def test_one_task_is_explained_as_well_as_by_the_truth(mdp, demonstrate):
     demonstration = demonstrate(2, 0.6)
-    found = dpm_birl(mdp, eta=ETA).fit(jax.random.key(0), demonstration)
+    found = dpm_birl(mdp, rationality=ETA).fit(jax.random.key(0), demonstration)
     counts = visit_counts(mdp, demonstration)
     truth = boltzmann_log_likelihoods(mdp, jnp.array([0.6]), counts, ETA).sum()
-    assert found.n_clusters == 1
+    assert found.n_components == 1
     assert found.objective >= float(truth) + lgamma(4) - lgamma(5) + log(0.5)
 
 
-def test_padding_one_trajectory_and_identical_trajectories(mdp, jumble):
-    method = dpm_birl(mdp, eta=ETA)
-    alone = method.fit(jax.random.key(0), jumble.select([0]))
+def test_padding_one_trajectory_and_identical_trajectories(mdp, trajectories):
+    method = dpm_birl(mdp, rationality=ETA)
+    alone = method.fit(jax.random.key(0), trajectories.select([0]))
     np.testing.assert_array_equal(alone.responsibilities, [[1]])
-    same = jumble.select([0, 0, 0, 0])
+    same = trajectories.select([0, 0, 0, 0])
     plain, padded = (method.fit(jax.random.key(1), d) for d in (same, same.padded(6, 12)))
     np.testing.assert_allclose(padded.objective, plain.objective)
     np.testing.assert_allclose(padded.responsibilities[4:], np.tile(plain.proportions, (2, 1)))

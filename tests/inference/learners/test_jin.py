@@ -97,26 +97,28 @@ def test_a_demonstration_is_learned_pair_by_pair(world):
     one_by_one = run_sessions(learner, demonstration.fragments(1).sessions(), key=jax.random.key(0))
     assert int(one_by_one.state.session) == 7
     assert np.allclose(at_once.state.weights, one_by_one.state.weights, atol=1e-12)
-    assert at_once.reports[0].iterations == 7
-    mistakes = [r.solver_iterations for r in one_by_one.reports]
-    assert at_once.reports[0].solver_iterations == sum(mistakes) > 0
+    assert at_once.infos[0].iterations == 7
+    mistakes = [r.solver_iterations for r in one_by_one.infos]
+    assert at_once.infos[0].solver_iterations == sum(mistakes) > 0
     # A pair that was predicted leaves the reward as it is, and only such a pair does.
     before = np.full(6, 1 / np.sqrt(6))
-    for report, mistaken in zip(one_by_one.reports, mistakes, strict=True):
-        assert np.array_equal(report.weights, before) == (mistaken == 0)
-        assert (report.gradient == 0) == (mistaken == 0)
-        before = report.weights
+    for info, mistaken in zip(one_by_one.infos, mistakes, strict=True):
+        assert np.array_equal(info.weights, before) == (mistaken == 0)
+        assert (info.gradient == 0) == (mistaken == 0)
+        before = info.weights
 
 
 def test_the_learning_rate_only_scales_a_reward_table(world):
     demonstration = walk(world, np.array([2, 1, 0, 2, 1, 1]), 1, 30)
     runs = [
         run_sessions(
-            jin_i2rl(world, learning_rate=rate), demonstration.fragments(5).sessions(), key=jax.random.key(0)
+            jin_i2rl(world, learning_rate=learning_rate),
+            demonstration.fragments(5).sessions(),
+            key=jax.random.key(0),
         )
-        for rate in (0.25, 4.0)
+        for learning_rate in (0.25, 4.0)
     ]
-    for slow, fast in zip(*(run.reports for run in runs), strict=True):
+    for slow, fast in zip(*(run.infos for run in runs), strict=True):
         assert np.allclose((slow.weights - 6**-0.5) * 16, fast.weights - 6**-0.5, atol=1e-9)
         assert slow.solver_iterations == fast.solver_iterations
 
@@ -131,8 +133,8 @@ def test_mistakes_are_bounded_where_the_expert_makes_every_correction_better(ran
     state, steps = learner.init(jax.random.key(0)), []
     for pair in walk(mdp, expert, 0, 400).fragments(1).sessions():
         before = state.weights
-        state, report = learner.update(state, pair)
-        if report.solver_iterations:
+        state, info = learner.update(state, pair)
+        if info.solver_iterations:
             steps.append(np.asarray(state.weights - before))
     margins = np.array(steps) @ true
     assert margins.min() > 0
@@ -167,9 +169,9 @@ def test_an_action_that_does_not_exist_is_refused(random_mdp):
         learner.update(learner.init(jax.random.key(0)), Demonstration.from_pairs([[9]], [[0]]))
     many = fleet(learner)
     stacked = Demonstration(*(np.asarray(x)[None] for x in impossible))
-    state, report = many.update(many.init(jax.random.key(0), 1), stacked)
+    state, info = many.update(many.init(jax.random.key(0), 1), stacked)
     assert state.session[0] == 0
-    assert np.isneginf(report.demonstration_log_likelihood[0])
+    assert np.isneginf(info.demonstration_log_likelihood[0])
     assert np.array_equal(state.weights[0], learner.init(jax.random.key(0)).weights)
 
 
@@ -178,11 +180,11 @@ def test_a_fleet_learns_what_its_members_would(world):
     learner = jin_i2rl_with_features(world, learning_rate=0.1)
     many = fleet(learner)
     stacked = Demonstration(*(np.stack(parts) for parts in zip(*demonstrations, strict=True)))
-    states, reports = many.update(many.init(jax.random.key(0), 3), stacked)
+    states, infos = many.update(many.init(jax.random.key(0), 3), stacked)
     for i, demonstration in enumerate(demonstrations):
-        state, report = learner.update(learner.init(jax.random.key(1)), demonstration)
+        state, info = learner.update(learner.init(jax.random.key(1)), demonstration)
         assert np.allclose(states.weights[i], state.weights, atol=1e-12)
-        assert reports.solver_iterations[i] == report.solver_iterations
+        assert infos.solver_iterations[i] == info.solver_iterations
 
 
 def test_a_journal_resumes_it_to_the_bit(world, tmp_path):

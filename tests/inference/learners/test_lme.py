@@ -67,12 +67,12 @@ def test_batch_em_reaches_a_maximum_of_the_exact_likelihood(mdp, sensor, demonst
 
 def test_a_first_session_of_everything_equals_batch(mdp, sensor, demonstration):
     learner = lme_i2rl(mdp, sensor, slack=0.01, tolerance=1e-7, iterations=3000)
-    _, report = learner.update(learner.init(jax.random.key(3)), demonstration)
+    _, info = learner.update(learner.init(jax.random.key(3)), demonstration)
     fit = batch_lme(mdp, sensor, slack=0.01, tolerance=1e-7, iterations=3000).fit(
         jax.random.key(1), demonstration
     )
-    assert np.allclose(report.weights, fit.weights, atol=1e-3)
-    assert report.demonstration_log_likelihood / 64 == pytest.approx(fit.log_likelihood, abs=1e-7)
+    assert np.allclose(info.weights, fit.weights, atol=1e-3)
+    assert info.demonstration_log_likelihood / 64 == pytest.approx(fit.log_likelihood, abs=1e-7)
 
 
 def test_more_iterations_never_lower_the_penalised_likelihood(mdp, sensor, demonstration, objective):
@@ -176,8 +176,8 @@ def test_the_exponentiated_gradient_stays_on_the_simplex(mdp, sensor, demonstrat
 def test_a_session_in_which_nothing_was_seen_is_allowed(mdp, sensor):
     learner = lme_i2rl(mdp, sensor)
     hidden = Demonstration.from_steps([["hidden"] * 4, [None] * 3], mdp)
-    state, report = learner.update(learner.init(jax.random.key(0)), hidden)
-    assert np.isfinite(report.log_likelihood)
+    state, info = learner.update(learner.init(jax.random.key(0)), hidden)
+    assert np.isfinite(info.log_likelihood)
     assert np.all(np.isfinite(np.asarray(state.weights)))
 
 
@@ -201,8 +201,8 @@ def test_an_impossible_observation_names_its_place_and_costs_nothing_learned(mdp
         DemonstrationError, match=r"trajectory 1, step 1: impossible observation.*excludes it"
     ):
         learner.update(before, out_of_view)
-    after, report = learner.update(before, Demonstration.from_pairs([[0]], [[1]]))
-    assert report.session == 2
+    after, info = learner.update(before, Demonstration.from_pairs([[0]], [[1]]))
+    assert info.session == 2
     assert np.all(np.isfinite(np.asarray(after.weights)))
 
 

@@ -33,7 +33,7 @@ def demonstrate(mdp):
 
 
 @pytest.fixture(scope="module")
-def jumble(demonstrate):
+def trajectories(demonstrate):
     return concatenate([demonstrate(0, TRUE[0]), demonstrate(1, TRUE[1])])
 
 
@@ -46,7 +46,7 @@ def log_likelihood(mdp):
 def test_one_expert_is_fitted_as_well_as_a_grid_search_fits_it(mdp, demonstrate, log_likelihood):
     demonstration = demonstrate(0, TRUE[0])
     counts = visit_counts(mdp, demonstration)
-    fit = mlirl(jax.random.key(0), mdp, demonstration, eta=ETA)
+    fit = mlirl(jax.random.key(0), mdp, demonstration, rationality=ETA)
     np.testing.assert_allclose(log_likelihood(fit.weights, counts).sum(), fit.log_likelihood, rtol=1e-10)
     assert fit.log_likelihood == fit.objective.max()
     assert fit.log_likelihood >= log_likelihood(TRUE[0], counts).sum()
@@ -64,24 +64,28 @@ def test_the_ascent_never_falls_and_stays_in_the_box(mdp, demonstrate):
     assert all((np.abs(point.weights) <= 1).all() for point in values)
 
 
-def test_the_marginal_likelihood_of_em_never_falls(mdp, jumble, log_likelihood):
-    trace = em_mlirl(mdp, clusters=2, eta=ETA, iterations=15, restarts=3).trace(jax.random.key(0), jumble)
+def test_the_marginal_likelihood_of_em_never_falls(mdp, trajectories, log_likelihood):
+    trace = em_mlirl(mdp, n_components=2, rationality=ETA, iterations=15, restarts=3).trace(
+        jax.random.key(0), trajectories
+    )
     assert trace.log_likelihoods.shape == (3, 16)
     assert (np.diff(trace.log_likelihoods, axis=1) >= -1e-8).all()
     weights, proportions, responsibilities, objective = trace.clustering
     assert objective == trace.log_likelihoods[:, -1].max()
     # What is reported belongs together, by the definition of a mixture.
-    counts = visit_counts(mdp, jumble)
+    counts = visit_counts(mdp, trajectories)
     joint = np.log(proportions) + np.stack([log_likelihood(w, counts) for w in weights], axis=1)
     assert np.logaddexp.reduce(joint, axis=1).sum() >= objective - 1e-8
     np.testing.assert_allclose(responsibilities.sum(1), 1)
     np.testing.assert_allclose(proportions, responsibilities.mean(0))
 
 
-def test_two_ways_are_told_apart(mdp, jumble, log_likelihood):
-    clustering = em_mlirl(mdp, clusters=2, eta=ETA, iterations=15, restarts=3).fit(jax.random.key(0), jumble)
+def test_two_ways_are_told_apart(mdp, trajectories, log_likelihood):
+    clustering = em_mlirl(mdp, n_components=2, rationality=ETA, iterations=15, restarts=3).fit(
+        jax.random.key(0), trajectories
+    )
     found, truth = clustering.assignments, np.repeat([0, 1], 8)
-    counts = visit_counts(mdp, jumble)
+    counts = visit_counts(mdp, trajectories)
     oracle = np.stack([log_likelihood(w, counts) for w in TRUE], axis=1)
     # No method can do better than somebody who knows both rewards.
     best = (oracle.argmax(1) == truth).mean()
@@ -89,30 +93,32 @@ def test_two_ways_are_told_apart(mdp, jumble, log_likelihood):
     assert clustering.objective >= np.logaddexp.reduce(oracle + np.log(0.5), axis=1).sum()
 
 
-def test_one_cluster_is_mlirl(mdp, jumble):
-    clustering = em_mlirl(mdp, clusters=1, eta=ETA, iterations=15, restarts=3).fit(jax.random.key(1), jumble)
-    alone = mlirl(jax.random.key(2), mdp, jumble, eta=ETA)
+def test_one_cluster_is_mlirl(mdp, trajectories):
+    clustering = em_mlirl(mdp, n_components=1, rationality=ETA, iterations=15, restarts=3).fit(
+        jax.random.key(1), trajectories
+    )
+    alone = mlirl(jax.random.key(2), mdp, trajectories, rationality=ETA)
     np.testing.assert_allclose(clustering.objective, alone.log_likelihood, atol=0.05)
     np.testing.assert_array_equal(clustering.responsibilities, 1)
 
 
-def test_padding_rows_and_identical_trajectories(mdp, jumble):
-    same = jumble.select([3] * 16)
-    em = em_mlirl(mdp, clusters=2, eta=ETA, iterations=15, restarts=3)
+def test_padding_rows_and_identical_trajectories(mdp, trajectories):
+    same = trajectories.select([3] * 16)
+    em = em_mlirl(mdp, n_components=2, rationality=ETA, iterations=15, restarts=3)
     plain, padded = (em.fit(jax.random.key(0), d) for d in (same, same.padded(18, 20)))
     assert np.ptp(plain.responsibilities, axis=0).max() < 1e-12
     np.testing.assert_allclose(padded.objective, plain.objective)
     np.testing.assert_allclose(padded.responsibilities[16:], np.tile(plain.proportions, (2, 1)))
 
 
-def test_bad_input_is_named(mdp, jumble):
-    em = em_mlirl(mdp, clusters=2, eta=ETA, iterations=3)
+def test_bad_input_is_named(mdp, trajectories):
+    em = em_mlirl(mdp, n_components=2, rationality=ETA, iterations=3)
     with pytest.raises(ValueError, match="2 clusters were asked for, but the demonstration has 1 trajectory"):
-        em.fit(jax.random.key(0), jumble.select([0]))
+        em.fit(jax.random.key(0), trajectories.select([0]))
     with pytest.raises(ValueError, match="clusters must be positive, got 0"):
-        em_mlirl(mdp, clusters=0)
+        em_mlirl(mdp, n_components=0)
     with pytest.raises(ValueError, match="eta must be positive, got -1"):
-        mlirl(jax.random.key(0), mdp, jumble, eta=-1)
+        mlirl(jax.random.key(0), mdp, trajectories, rationality=-1)
     hidden = Demonstration.from_steps([[(0, 0)], ["hidden"]], mdp)
     with pytest.raises(DemonstrationError, match="trajectory 1, step 0 is hidden"):
         em.fit(jax.random.key(0), hidden)

@@ -57,7 +57,7 @@ def test_it_finds_who_did_what_and_why(sorting, batch, counts):
     for seed in range(3):
         mixed = demonstrate_sorting(jax.random.key(seed), sorting, counts, STEPS)
         found = batch.fit(jax.random.key(seed), mixed.demonstration)
-        assert found.n_clusters == np.count_nonzero(counts)
+        assert found.n_components == np.count_nonzero(counts)
         assert assignment_accuracy(mixed.labels, found.assignments) == 1
         assert lost(sorting, mixed, found.weights, found.assignments) == 0
         np.testing.assert_allclose(found.proportions.sum(), 1, atol=1e-9)
@@ -108,13 +108,13 @@ def shuffled_stream(sorting, seed, counts, late=()):
 @pytest.mark.parametrize("seed", range(3))
 def test_online_finds_what_batch_finds_and_a_way_that_comes_late(sorting, online, seed):
     demonstration, labels = shuffled_stream(sorting, seed, (12, 12), (4, 4, 4))
-    state, ways = online.init(jax.random.key(seed)), []
+    state, n_components = online.init(jax.random.key(seed)), []
     for session in demonstration.sessions(4):
-        state, report = online.update(state, session)
-        ways.append(report.ways)
-    assert ways[5] == 2
-    assert ways[-1] == 3
-    found = clustering_of(state, report)
+        state, info = online.update(state, session)
+        n_components.append(info.n_components)
+    assert n_components[5] == 2
+    assert n_components[-1] == 3
+    found = clustering_of(state, info)
     shares = assign_trajectories(sorting.mdp, None, found.weights, found.proportions, demonstration)
     assert assignment_accuracy(labels, shares.argmax(1)) == 1
     loss = expected_value_difference(
@@ -130,8 +130,8 @@ def test_one_trajectory_after_the_other_is_enough(sorting, online):
     demonstration, _ = shuffled_stream(sorting, 4, (8, 8))
     state = online.init(jax.random.key(0))
     for session in demonstration.sessions(1):
-        state, report = online.update(state, session)
-    assert report.ways == 2
+        state, info = online.update(state, session)
+    assert info.n_components == 2
 
 
 def test_a_resumed_learner_equals_one_that_was_never_stopped(sorting, online, tmp_path):
@@ -153,7 +153,7 @@ def test_a_resumed_learner_equals_one_that_was_never_stopped(sorting, online, tm
 
 @pytest.mark.parametrize("behaviours", [(0,), (0, 1)])
 def test_at_the_full_price_people_who_err_are_not_split_by_their_errors(sorting, behaviours):
-    full = batch_mme_mtirl(sorting.mdp, price=1.0)
+    full = batch_mme_mtirl(sorting.mdp, temperature=1.0)
     for seed in range(3):
         key = jax.random.key(seed)
         codes = [
@@ -163,7 +163,7 @@ def test_at_the_full_price_people_who_err_are_not_split_by_their_errors(sorting,
             for b in behaviours
         ]
         found = full.fit(key, Demonstration.from_codes(np.concatenate([np.asarray(c) for c in codes])))
-        assert found.n_clusters == len(behaviours)
+        assert found.n_components == len(behaviours)
         # Who errs may for once do what the other would.
         assert assignment_accuracy(np.repeat(behaviours, 16), found.assignments) > 0.85
 
@@ -172,20 +172,20 @@ def test_what_a_report_says_of_all_that_is_kept_is_the_learner_s_log_likelihood(
     demonstration, _ = shuffled_stream(sorting, 6, (6, 6))
     state = online.init(jax.random.key(0))
     for session in demonstration.sessions(4):
-        state, report = online.update(state, session)
-        assert online.log_likelihood(state, state.weights) == pytest.approx(report.log_likelihood, abs=1e-9)
-    assert online.log_likelihood(state, np.zeros_like(state.weights)) < report.log_likelihood
+        state, info = online.update(state, session)
+        assert online.log_likelihood(state, state.weights) == pytest.approx(info.log_likelihood, abs=1e-9)
+    assert online.log_likelihood(state, np.zeros_like(state.weights)) < info.log_likelihood
 
 
 def test_streams_whose_first_session_is_empty_learn_from_the_next(sorting):
-    learner = mme_mtirl(sorting.mdp, ways=2, restarts=1)
+    learner = mme_mtirl(sorting.mdp, n_components=2, restarts=1)
     demonstration = demonstrate_sorting(jax.random.key(0), sorting, (2, 2), 20).demonstration
     empty = demonstration._replace(kind=np.full_like(demonstration.kind, PAD))
     stream = jax.tree.map(lambda *x: np.stack(x)[None], empty, demonstration, empty)
-    state, report = run_streams(learner, jax.random.key(0), stream)
-    np.testing.assert_array_equal(report.ways, [[0, 2, 2]])
+    state, info = run_streams(learner, jax.random.key(0), stream)
+    np.testing.assert_array_equal(info.n_components, [[0, 2, 2]])
     np.testing.assert_allclose(state.mass.sum(), 4, atol=1e-9)
-    assert np.isfinite(report.log_likelihood).all()
+    assert np.isfinite(info.log_likelihood).all()
 
 
 # -- bad input ----------------------------------------------------------------------------------------
@@ -194,12 +194,12 @@ def test_streams_whose_first_session_is_empty_learn_from_the_next(sorting):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"ways": 0}, "ways must be at least 1, got 0"),
-        ({"ways": 2.5}, "ways must be a whole number, got 2.5"),
-        ({"price": 0.0}, "price must be more than zero"),
+        ({"n_components": 0}, "ways must be at least 1, got 0"),
+        ({"n_components": 2.5}, "ways must be a whole number, got 2.5"),
+        ({"temperature": 0.0}, "price must be more than zero"),
         ({"ridge": -1.0}, "ridge must be finite and not negative"),
         ({"strength": float("nan")}, "strength must be finite and not negative, got nan"),
-        ({"price": float("inf")}, "price must be finite"),
+        ({"temperature": float("inf")}, "price must be finite"),
         ({"tolerance": float("nan")}, "tolerance must be a number"),
     ],
 )
@@ -213,20 +213,20 @@ def test_fewer_trajectories_than_ways_are_said_and_not_crashed(sorting, batch):
     mixed = demonstrate_sorting(jax.random.key(0), sorting, (1, 1), STEPS)
     with pytest.warns(UserWarning, match="4 ways were to be started from, but there are 2 trajectories"):
         found = batch.fit(jax.random.key(0), mixed.demonstration)
-    assert 1 <= found.n_clusters <= 2
+    assert 1 <= found.n_components <= 2
 
 
 def test_one_trajectory_is_one_way(sorting, batch):
     mixed = demonstrate_sorting(jax.random.key(0), sorting, (1, 0), STEPS)
     found = quietly(batch.fit, jax.random.key(0), mixed.demonstration)
-    assert found.n_clusters == 1
+    assert found.n_components == 1
     assert lost(sorting, mixed, found.weights, found.assignments) == 0
 
 
 def test_identical_trajectories_are_one_way(sorting, batch):
     one = demonstrate_sorting(jax.random.key(0), sorting, (1, 0), STEPS).demonstration
     found = batch.fit(jax.random.key(0), concatenate([one] * 8))
-    assert found.n_clusters == 1
+    assert found.n_components == 1
     np.testing.assert_array_equal(found.responsibilities, np.ones((8, 1)))
 
 

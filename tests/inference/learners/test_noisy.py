@@ -65,7 +65,7 @@ def divergence(task, agreement):
 def test_the_sensor_is_learned_far_better_than_a_guess_of_one_half(scores):
     _mdp, seen, _ = stream()
     run = run_sessions(learned_with(scores), seen, key=KEY)
-    assert divergence(task(), run.reports[-1].agreement) < divergence(task(), np.full(8, 0.5)) / 6
+    assert divergence(task(), run.infos[-1].agreement) < divergence(task(), np.full(8, 0.5)) / 6
 
 
 def test_knowing_the_truth_is_the_upper_bound_of_the_alternation():
@@ -76,7 +76,7 @@ def test_knowing_the_truth_is_the_upper_bound_of_the_alternation():
     psi = task().features
     share = (psi[:, reports.state, reports.action] == psi[:, happened.state, happened.action]).mean((1, 2))
     # The slack of a quarter of a report, and forgetting, are all that stands between.
-    assert np.abs(run.reports[-1].agreement - share).max() < 0.06
+    assert np.abs(run.infos[-1].agreement - share).max() < 0.06
 
 
 def test_alternations_climb_the_exact_likelihood_of_the_reports():
@@ -105,7 +105,7 @@ def test_with_a_reliable_sensor_it_is_online_maximum_entropy_irl():
     mdp, _, truth = stream()
     identity = np.arange(mdp.n_states * mdp.n_actions).reshape(1, mdp.n_states, mdp.n_actions)
     settings = {"slack": 0.0, "ridge": 0.1, "iterations": 30, "tolerance": 1e-8}
-    ours = rimeo(mdp, identity, scores="none", start=1 - 1e-6, errors=0.0, memory=1.0, **settings)
+    ours = rimeo(mdp, identity, scores="none", start=1 - 1e-6, errors=0.0, forgetting=1.0, **settings)
     theirs = lme_i2rl(mdp, Sensor(), **settings)
     a, b = (run_sessions(x, truth, key=KEY).state.weights for x in (ours, theirs))
     np.testing.assert_allclose(a, b, atol=1e-3)
@@ -114,7 +114,7 @@ def test_with_a_reliable_sensor_it_is_online_maximum_entropy_irl():
 def test_a_score_of_nearly_one_makes_reports_the_truth():
     _mdp, _, truth = stream()
     sure = [x._replace(score=np.where(x.kind == SEEN, 1.0, np.nan)) for x in truth]
-    report = run_sessions(learned_with("stepwise"), sure, key=KEY).reports[-1]
+    report = run_sessions(learned_with("stepwise"), sure, key=KEY).infos[-1]
     assert report.agreement.min() > 0.99
 
 
@@ -160,10 +160,10 @@ def test_sessions_without_a_report_do_not_unlearn_what_was_assumed(solver):
 
 def test_casadi_and_compiled_programs_agree():
     mdp, seen, _ = stream()
-    compiled = run_sessions(rimeo(mdp, task().predicates, tolerance=1e-9), seen[:2], key=KEY).reports
+    compiled = run_sessions(rimeo(mdp, task().predicates, tolerance=1e-9), seen[:2], key=KEY).infos
     posed = run_sessions(
         rimeo(mdp, task().predicates, solver="ipopt", tolerance=1e-9), seen[:2], key=KEY
-    ).reports
+    ).infos
     for a, b in zip(compiled, posed, strict=True):
         np.testing.assert_allclose(a.agreement, b.agreement, atol=1e-5)
         np.testing.assert_allclose(a.weights, b.weights, atol=1e-4)
@@ -220,7 +220,7 @@ def test_the_moving_window_stops_a_stream_that_has_settled():
         learned_with("averaged"), seen * 10, key=KEY, stop=MovingWindow(5, 0.05, of="gradient")
     )
     assert run.stopped
-    assert len(run.reports) < 60
+    assert len(run.infos) < 60
 
 
 # -- variants and controls ----------------------------------------------------------------------------
@@ -228,22 +228,22 @@ def test_the_moving_window_stops_a_stream_that_has_settled():
 
 def test_taking_reports_for_truths_ends_in_believing_them():
     mdp, seen, _ = stream()
-    report = run_sessions(
-        rimeo(mdp, task().features, scores="none", truths="observed"), seen, key=KEY
-    ).reports[-1]
+    report = run_sessions(rimeo(mdp, task().features, scores="none", truths="observed"), seen, key=KEY).infos[
+        -1
+    ]
     assert report.agreement.min() > 0.98
 
 
 def test_fair_frequencies_are_the_smoothed_mean_score():
     mdp, seen, _ = stream()
-    report = run_sessions(rifom(mdp, task().features), seen, key=KEY).reports[-1]
+    report = run_sessions(rifom(mdp, task().features), seen, key=KEY).infos[-1]
     scores = np.clip(np.concatenate([x.score.ravel() for x in seen]), 1 - CERTAIN, CERTAIN)
     np.testing.assert_allclose(report.agreement, (scores.sum() + 1) / (len(scores) + 2))
 
 
 def test_coded_frequencies_credit_what_is_true_of_each_last_report():
     mdp, seen, _ = stream()
-    report = run_sessions(rifom(mdp, task().predicates, form="coded"), seen[:1], key=KEY).reports[-1]
+    report = run_sessions(rifom(mdp, task().predicates, form="coded"), seen[:1], key=KEY).infos[-1]
     true = task().predicates[:, seen[0].state[:, -1], seen[0].action[:, -1]].sum(1) + 1e-4
     np.testing.assert_allclose(report.agreement, true / (true.sum() + 8e-4))
 
@@ -251,7 +251,7 @@ def test_coded_frequencies_credit_what_is_true_of_each_last_report():
 def test_the_printed_program_is_no_better_than_a_guess():
     mdp, seen, _ = stream()
     learner = rimeo(mdp, task().predicates, truths="all")
-    report = run_sessions(learner, seen, key=KEY).reports[-1]
+    report = run_sessions(learner, seen, key=KEY).infos[-1]
     assert divergence(task(), report.agreement) > divergence(task(), np.full(8, 0.5)) / 6
 
 
@@ -324,7 +324,7 @@ def test_truths_that_do_not_fit_the_reports_are_named():
     with pytest.raises(DemonstrationError, match="trajectory 1, step 2: what happened must be a pair"):
         learner.update(state, WithTruth(seen[0], truth[0]._replace(state=lost)))
     with pytest.raises(ValueError, match="memory is an exponent"):
-        rifom(mdp, task().features, memory=2.0)
+        rifom(mdp, task().features, forgetting=2.0)
 
 
 @pytest.mark.parametrize(
@@ -335,7 +335,7 @@ def test_truths_that_do_not_fit_the_reports_are_named():
         ({"scores": "some"}, "scores must be one of"),
         ({"truths": "guess"}, "truths must be one of"),
         ({"errors": -1.0}, "errors must be"),
-        ({"memory": 0.0}, "memory is an exponent"),
+        ({"forgetting": 0.0}, "memory is an exponent"),
         ({"start": 1.0}, "between 0 and 1"),
         ({"iterations": 0}, "at least one iteration"),
         ({"truths": "all", "scores": "none"}, "made of scores"),

@@ -59,7 +59,7 @@ def demonstration(mdp, sensor):
 
 
 @pytest.fixture(scope="module")
-def jumble(mdp, sensor, demonstration):
+def trajectories(mdp, sensor, demonstration):
     return seen_in_part(mdp, sensor, demonstration)
 
 
@@ -72,11 +72,11 @@ def whole(mdp):
     return seen_whole(mdp, sensor, Demonstration.from_codes(np.concatenate(codes)))
 
 
-def started(mdp, jumble, seed, ways=WAYS):
+def started(mdp, trajectories, seed, n_components=WAYS):
     """Random assignments, and the visits that follow from them when nothing is known of any reward."""
-    shares = jax.random.dirichlet(jax.random.key(seed), jnp.ones(ways), jumble.live.shape)
-    shares = shares * jumble.live[:, None]
-    return shares, jnp.einsum("nd,nsa->dsa", shares, without_reward(mdp, jumble).visits)
+    shares = jax.random.dirichlet(jax.random.key(seed), jnp.ones(n_components), trajectories.live.shape)
+    shares = shares * trajectories.live[:, None]
+    return shares, jnp.einsum("nd,nsa->dsa", shares, without_reward(mdp, trajectories).visits)
 
 
 def dense(mdp):
@@ -88,16 +88,18 @@ def dense(mdp):
 
 
 @pytest.mark.parametrize("seed", range(3))
-@pytest.mark.parametrize("seen", ["whole", "jumble"])
-@pytest.mark.parametrize("price", [0.3, 1.0])
-def test_the_objective_never_falls(mdp, program, seen, seed, price, request):
-    jumble = request.getfixturevalue(seen)
+@pytest.mark.parametrize("seen", ["whole", "trajectories"])
+@pytest.mark.parametrize("temperature", [0.3, 1.0])
+def test_the_objective_never_falls(mdp, program, seen, seed, temperature, request):
+    trajectories = request.getfixturevalue(seen)
     kept = Kept(jnp.array([2.0, 0.5, 0.0]), jnp.zeros((WAYS, *mdp.available.shape)))
-    shares, visits = started(mdp, jumble, seed)
-    program = program._replace(price=price, tolerance=-jnp.inf)
+    shares, visits = started(mdp, trajectories, seed)
+    program = program._replace(temperature=temperature, tolerance=-jnp.inf)
     values = [
         float(
-            climbed(program._replace(iterations=i), jumble, kept, empty_mixture(mdp, WAYS), shares, visits)[6]
+            climbed(
+                program._replace(iterations=i), trajectories, kept, empty_mixture(mdp, WAYS), shares, visits
+            )[6]
         )
         for i in range(1, 16)
     ]
@@ -111,21 +113,21 @@ def policies_of(mdp, weights):
     return jax.lax.map(lambda w: soft_plan(mdp, reward_of(mdp, w)).policy, weights)
 
 
-def objective_of(mdp, program, jumble: SeenWhole, kept, mixture, shares):
+def objective_of(mdp, program, trajectories: SeenWhole, kept, mixture, shares):
     """J as the module states it, term by term."""
-    total, visits, constant = 0.0, np.asarray(jumble.visits), np.asarray(jumble.constant)
+    total, visits, constant = 0.0, np.asarray(trajectories.visits), np.asarray(trajectories.constant)
     policies = np.asarray(policies_of(mdp, mixture.weights))
     parts = zip(*(np.asarray(x) for x in (mixture.weights, mixture.proportions)), policies, strict=True)
     for d, (w, p, policy) in enumerate(parts):
         log_policy = np.log(np.where(policy > 0, policy, 1.0))
         log_pi = np.log(p) if p > 0 else 0.0
         total += (np.asarray(kept.visits[d]) * log_policy).sum()
-        total += program.price * (kept.mass[d] * log_pi + program.strength * p * log_pi)
-        total -= program.l1 * np.abs(w).sum() + program.ridge / 2 * (w**2).sum()
+        total += program.temperature * (kept.mass[d] * log_pi + program.strength * p * log_pi)
+        total -= program.slack * np.abs(w).sum() + program.ridge / 2 * (w**2).sum()
         for i, v in enumerate(np.asarray(shares)[:, d]):
             if v > 0:
                 likelihood = constant[i] + (visits[i] * log_policy).sum()
-                total += v * likelihood - program.price * v * (np.log(v) - log_pi)
+                total += v * likelihood - program.temperature * v * (np.log(v) - log_pi)
     return float(total)
 
 
@@ -165,13 +167,15 @@ def test_mergers_that_are_not_tried_would_not_have_paid(mdp, program):
     demonstration = Demonstration.from_codes(np.concatenate(codes))
     whole, in_part = (f(mdp, sensor, demonstration) for f in (seen_whole, seen_in_part))
     taken = []
-    for swapped, price in product((0, 1, 2), (0.2, 0.6)):
+    for swapped, temperature in product((0, 1, 2), (0.2, 0.6)):
         labels = np.roll(np.repeat([0, 1], 6), swapped)
         shares = jnp.eye(WAYS)[labels]
-        cheap = program._replace(price=price, ridge=0.02, iterations=1)
+        cheap = program._replace(temperature=temperature, ridge=0.02, iterations=1)
         visits = jnp.einsum("nd,nsa->dsa", shares, whole.visits)
         fit = climbed(cheap, whole, nothing_kept(mdp, WAYS), empty_mixture(mdp, WAYS), shares, visits)
-        (paid, one, _), (pays, other, _) = (merged(cheap, jumble, fit) for jumble in (whole, in_part))
+        (paid, one, _), (pays, other, _) = (
+            merged(cheap, trajectories, fit) for trajectories in (whole, in_part)
+        )
         assert paid == pays
         if paid:
             np.testing.assert_allclose(one.mixture.weights, other.mixture.weights, atol=1e-6)
@@ -185,7 +189,7 @@ def test_mergers_that_are_not_tried_would_not_have_paid(mdp, program):
     st.floats(0.1, 1),
 )
 @settings(max_examples=50, deadline=None)
-def test_at_price_one_assignments_are_bayes_rule(likelihoods, proportions, price):
+def test_at_price_one_assignments_are_bayes_rule(likelihoods, proportions, temperature):
     table = jnp.array(likelihoods).reshape(3, 2)
     pi = jnp.array(proportions) / sum(proportions)
     live = jnp.array([True, True])
@@ -194,7 +198,7 @@ def test_at_price_one_assignments_are_bayes_rule(likelihoods, proportions, price
     np.testing.assert_allclose(bayes.responsibilities, (joint / joint.sum(0)).T, rtol=1e-9, atol=1e-300)
     np.testing.assert_allclose(bayes.log_likelihood, np.log(joint.sum(0)), atol=1e-9)
     np.testing.assert_allclose(bayes.value, bayes.log_likelihood, atol=1e-9)
-    cheap = assign(table, pi, live, price)
+    cheap = assign(table, pi, live, temperature)
     np.testing.assert_allclose(cheap.responsibilities.sum(1), 1, atol=1e-12)
     np.testing.assert_allclose(cheap.log_likelihood, bayes.log_likelihood, atol=1e-9)
 
@@ -231,17 +235,17 @@ def test_hidden_steps_are_summed_out(mdp, sensor):
     np.testing.assert_allclose(got, (joint / joint.sum(0)).T, atol=1e-10)
 
 
-@pytest.mark.parametrize("price", [0.5, 1.0])
+@pytest.mark.parametrize("temperature", [0.5, 1.0])
 @pytest.mark.parametrize("seed", range(2))
-def test_one_program_and_alternation_reach_the_same_objective(mdp, program, whole, seed, price):
-    program = program._replace(price=price, iterations=5000, tolerance=1e-11)
+def test_one_program_and_alternation_reach_the_same_objective(mdp, program, whole, seed, temperature):
+    program = program._replace(temperature=temperature, iterations=5000, tolerance=1e-11)
     blurred = 0.7 * np.eye(WAYS)[np.repeat([0, 1], 6)] + 0.3 * np.asarray(started(mdp, whole, seed)[0])
     visits = jnp.einsum("nd,nsa->dsa", blurred, whole.visits)
     fit = climbed(
         program, whole, nothing_kept(mdp, WAYS), empty_mixture(mdp, WAYS), jnp.asarray(blurred), visits
     )
     joint = MinMaxProgram(mdp, WAYS, 12).solve(
-        np.asarray(whole.visits), 1.0, 0.0, 0.2, price=price, responsibilities=blurred
+        np.asarray(whole.visits), 1.0, 0.0, 0.2, temperature=temperature, responsibilities=blurred
     )
     dynamics = float(whole.constant.sum())
     assert joint.objective + dynamics == pytest.approx(float(fit.objective), abs=1e-6)

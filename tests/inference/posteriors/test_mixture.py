@@ -177,8 +177,8 @@ def assert_mean(draws, expected, floor=1e-3):
 
 
 def shared_ways(idata):
-    ways = idata.assignments.assignment.values
-    return ways[..., :, None] == ways[..., None, :]
+    components = idata.assignments.assignment.values
+    return components[..., :, None] == components[..., None, :]
 
 
 def test_the_process_scores_a_partition_seat_by_seat():
@@ -200,9 +200,9 @@ def test_partitions_and_weights_agree_with_enumeration(idata, exact):
     for i in range(N):
         for j in range(i):
             assert_mean(shared[..., i, j], expected[i, j])
-    ways = exact.partitions.max(1) + 1
+    components = exact.partitions.max(1) + 1
     for k in (1, 2, 3):
-        assert_mean(idata.assignments.n_ways == k, posterior[ways == k].sum())
+        assert_mean(idata.assignments.n_components == k, posterior[components == k].sum())
     assert_mean(idata.posterior.concentration, concentration)
     weights = np.einsum("p,pnk->nk", posterior, exact.trajectory_weights)
     drawn = label_invariant(idata).trajectory_weights
@@ -241,7 +241,7 @@ def test_what_is_compared_and_ranked_does_not_depend_on_labels(posteriors):
     ranked = invariant_statistics(drawn, ("home", "turned"))
     for name, value in invariant_statistics(renamed, ("home", "turned")).items():
         np.testing.assert_allclose(value, ranked[name], rtol=1e-12, err_msg=name)
-    np.testing.assert_array_equal(ranked["ways"], group.n_ways)
+    np.testing.assert_array_equal(ranked["components"], group.n_components)
     together = group.co_clustering.values
     assert ranked["pairs together"].mean() == pytest.approx((together.sum() - N) / 2)
 
@@ -259,11 +259,11 @@ def test_without_information_partitions_follow_the_process(demonstration, sensor
     """Nobody wants anything: features are zero, and the posterior is the prior."""
     indifferent = ring(np.zeros((4, 2, 2)))
     partitions = partitions_of(N)
-    (chance, _), ways = weighed(partitions), partitions.max(1) + 1
+    (chance, _), components = weighed(partitions), partitions.max(1) + 1
     for sample in SAMPLERS.values():
         idata = sample(jax.random.key(1), indifferent, sensor, demonstration)
         for k in range(1, 5):
-            assert_mean(idata.assignments.n_ways == k, chance[ways == k].sum())
+            assert_mean(idata.assignments.n_components == k, chance[components == k].sum())
         assert_mean(shared_ways(idata)[..., 0, 4], chance[partitions[:, 0] == partitions[:, 4]].sum())
         assert_mean(idata.posterior.concentration, 0.6)
         assert_mean((idata.posterior.proportions**2).sum("component"), self_meeting())
@@ -296,7 +296,7 @@ def test_one_trajectory_under_a_prior_on_positive_weights(mdp, sensor, demonstra
     exact = enumerate_partitions(mdp, sensor, one, lambda w: half.log_prob(w).sum(-1), axis)
     options = {"concentration": 0.8, "prior": half, "chains": 2, "components": 3, "draws": 500, "thin": 2}
     idata = gibbs_mixture_posterior(jax.random.key(3), mdp, sensor, one, **options)
-    assert (idata.assignments.n_ways == 1).all()
+    assert (idata.assignments.n_components == 1).all()
     assert idata.assignments.co_clustering.values == [[1.0]]
     assert "concentration" not in idata.posterior
     weights = label_invariant(idata).trajectory_weights
@@ -305,15 +305,17 @@ def test_one_trajectory_under_a_prior_on_positive_weights(mdp, sensor, demonstra
 
 
 def test_the_concentration_moves_towards_its_conditional():
-    prior, ways, n = dist.Gamma(2.0, 1.0), 3, 9
+    prior, components, n = dist.Gamma(2.0, 1.0), 3, 9
 
     def density(x):
-        return np.exp(np.log(x) - x + ways * np.log(x) + gammaln(x) - gammaln(x + n))
+        return np.exp(np.log(x) - x + components * np.log(x) + gammaln(x) - gammaln(x + n))
 
     total, mean = (integrate.quad(lambda x, p=p: x**p * density(x), 0, 40)[0] for p in (0, 1))
     step = jax.jit(
         lambda key: jax.lax.scan(
-            lambda x, k: (move_concentration(k, x, prior, ways, n),) * 2, 1.0, jax.random.split(key, 4000)
+            lambda x, k: (move_concentration(k, x, prior, components, n),) * 2,
+            1.0,
+            jax.random.split(key, 4000),
         )[1]
     )
     draws = np.stack([step(jax.random.key(seed)) for seed in (0, 1)])
@@ -331,24 +333,24 @@ def test_draws_are_those_of_the_declared_model(idata, mdp, sensor, demonstration
     drawn = idata.log_likelihood.demonstration[1, 3].sum()
     expected = log_likelihood(mdp, sensor, jnp.asarray(demonstration.codes), sites)
     np.testing.assert_allclose(drawn, expected, rtol=1e-8)
-    ways = idata.assignments.assignment.values[1, 3]
-    used, labels = np.unique(ways, return_inverse=True)
+    components = idata.assignments.assignment.values[1, 3]
+    used, labels = np.unique(components, return_inverse=True)
     joint = process(labels[None], alpha)[0] + dist.Normal(0.0, SD).log_prob(weights[used]).sum()
     joint += ALPHA.log_prob(alpha)
-    joint += log_probabilities(mdp, weights[ways], sensor, jnp.asarray(demonstration.codes)).sum()
+    joint += log_probabilities(mdp, weights[components], sensor, jnp.asarray(demonstration.codes)).sum()
     np.testing.assert_allclose(idata.assignments.log_joint[1, 3], joint, rtol=1e-8)
 
 
 def test_diagnosis_is_by_what_does_not_depend_on_labels(idata):
     invariant = label_invariant(idata)
     summary = az.summary(invariant, round_to="none")
-    assert list(summary.index[:3]) == ["n_ways", "log_joint", "log_likelihood"]
+    assert list(summary.index[:3]) == ["n_components", "log_joint", "log_likelihood"]
     assert summary.loc["concentration", "mean"] == pytest.approx(float(idata.posterior.concentration.mean()))
     assert "trajectory_weights[5, turned]" in summary.index
     assert summary["r_hat"].max() < 1.1
     assert summary["ess_bulk"].min() > 20
-    axes = az.plot_trace(invariant, var_names=["n_ways", "concentration", "log_joint"], compact=False)
-    assert [axis.get_title() for axis in axes[:, 0]] == ["n_ways", "concentration", "log_joint"]
+    axes = az.plot_trace(invariant, var_names=["n_components", "concentration", "log_joint"], compact=False)
+    assert [axis.get_title() for axis in axes[:, 0]] == ["n_components", "concentration", "log_joint"]
     drawn = [line.get_ydata() for line in axes[1, 1].lines[:2]]
     np.testing.assert_array_equal(drawn, idata.posterior.concentration)
     plt.close("all")
@@ -360,17 +362,17 @@ def test_diagnosis_is_by_what_does_not_depend_on_labels(idata):
 
 
 def test_the_number_of_ways_and_who_shares_one_are_those_of_the_assignments(idata):
-    ways = idata.assignments.assignment.values
-    numbers = np.apply_along_axis(lambda row: len(set(row)), -1, ways)
-    np.testing.assert_array_equal(idata.assignments.n_ways, numbers)
+    components = idata.assignments.assignment.values
+    numbers = np.apply_along_axis(lambda row: len(set(row)), -1, components)
+    np.testing.assert_array_equal(idata.assignments.n_components, numbers)
     chance = idata.assignments.n_ways_probability
-    assert list(chance.ways) == list(range(1, N + 1))
+    assert list(chance.components) == list(range(1, N + 1))
     np.testing.assert_allclose(chance, [(numbers == k).mean() for k in range(1, N + 1)])
     together = idata.assignments.co_clustering
     assert together.dims == ("trajectory", "trajectory_")
     np.testing.assert_array_equal(np.diag(together), 1.0)
     pair = together.sel(trajectory=0, trajectory_=4)
-    assert float(pair) == pytest.approx((ways[..., 0] == ways[..., 4]).mean())
+    assert float(pair) == pytest.approx((components[..., 0] == components[..., 4]).mean())
 
 
 def test_posterior_survives_a_file(idata, tmp_path):
@@ -386,8 +388,8 @@ def test_gibbs_writes_out_as_many_components_as_draws_need(mdp, sensor, demonstr
     options = {**SAMPLERS["gibbs"].keywords, "components": 1}
     small = gibbs_mixture_posterior(jax.random.key(0), mdp, sensor, demonstration, **options)
     large = posteriors["gibbs"]
-    assert (small.assignments.n_ways == large.assignments.n_ways).all()
-    assert small.posterior.sizes["component"] == int(small.assignments.n_ways.max()) + 1
+    assert (small.assignments.n_components == large.assignments.n_components).all()
+    assert small.posterior.sizes["component"] == int(small.assignments.n_components.max()) + 1
 
 
 def test_rows_of_padding_are_no_trajectories(mdp, sensor, demonstration, posteriors):

@@ -44,7 +44,7 @@ def cells(weights):
     return np.histogram2d(*weights.reshape(-1, 2).T, bins=4, range=[[-1, 1]] * 2)[0] / (weights.size / 2)
 
 
-OPTIONS = {"eta": ETA, "draws": 10_000, "warmup": 500, "chains": 2}
+OPTIONS = {"rationality": ETA, "draws": 10_000, "warmup": 500, "chains": 2}
 PRIORS = {
     "uniform": (None, lambda w: np.zeros(len(w))),
     "normal": (dist.Normal(0.5, 0.4), lambda w: -(((w - 0.5) / 0.4) ** 2).sum(1) / 2),

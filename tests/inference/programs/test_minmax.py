@@ -33,12 +33,12 @@ def visits_of(states, actions, mdp):
     return counts
 
 
-def mixed_visits(mdp, seed, each=8, length=12, ways=2, scale=3.0):
-    """Visits of soft-optimal agents with ``ways`` random rewards, ``each`` trajectories of each."""
-    weights = np.random.default_rng(seed).normal(0, scale, (ways, mdp.n_features))
+def mixed_visits(mdp, seed, each=8, length=12, components=2, scale=3.0):
+    """Visits of soft-optimal agents with ``components`` random rewards, ``each`` trajectories of each."""
+    weights = np.random.default_rng(seed).normal(0, scale, (components, mdp.n_features))
     policies = jnp.stack([jnp.where(mdp.available, log_policy(mdp, row), -jnp.inf) for row in weights])
-    keys = jax.random.split(jax.random.key(seed), ways * each)
-    states, actions = simulate_all(keys, mdp, policies[np.repeat(np.arange(ways), each)], length)
+    keys = jax.random.split(jax.random.key(seed), components * each)
+    states, actions = simulate_all(keys, mdp, policies[np.repeat(np.arange(components), each)], length)
     return visits_of(states, actions, mdp)
 
 
@@ -50,7 +50,7 @@ def sorting_visits(seed, counts):
 
 class Prior(NamedTuple):
     strength: float = 1.0
-    l1: float = 0.1
+    slack: float = 0.1
     ridge: float = 0.1
 
 
@@ -64,7 +64,7 @@ def objective_of(mdp, counts, weights, proportions, prior):
     log_proportions = jnp.log(jnp.where(mixed, proportions, 1.0))
     joint = jnp.where(mixed, log_proportions, -jnp.inf) + jnp.einsum("disa,dsa->id", counts, policies)
     scaled = weights * feature_scale(mdp)
-    penalty = prior.l1 * jnp.abs(scaled).sum() + prior.ridge / 2 * (scaled**2).sum()
+    penalty = prior.slack * jnp.abs(scaled).sum() + prior.ridge / 2 * (scaled**2).sum()
     entropic = prior.strength * (proportions * log_proportions).sum()
     return jax.nn.logsumexp(joint, axis=1).sum() + entropic - penalty, jax.nn.softmax(joint, axis=1)
 
@@ -77,7 +77,7 @@ def alternate(mdp, counts, shares, prior, sweeps=2000):
     for _ in range(sweeps):
         proportions = entropic_proportions(shares.sum(0), prior.strength)
         fits = [
-            fit_counts(mdp, np.tensordot(shares[:, d], counts[d], 1), prior.l1, prior.ridge, warm[d])
+            fit_counts(mdp, np.tensordot(shares[:, d], counts[d], 1), prior.slack, prior.ridge, warm[d])
             for d in range(shares.shape[1])
         ]
         warm = [fit.warm() for fit in fits]
@@ -246,7 +246,7 @@ def test_malformed_counts_and_penalties_are_named(mdp, program):
     ):
         with pytest.raises(ValueError, match=named):
             program.solve(given, weights=weights)
-    for penalty in ({"strength": -1.0}, {"l1": -1.0}, {"ridge": np.nan}, {"l1": np.zeros(2)}):
+    for penalty in ({"strength": -1.0}, {"slack": -1.0}, {"ridge": np.nan}, {"slack": np.zeros(2)}):
         with pytest.raises(ValueError, match=next(iter(penalty))):
             program.solve(counts, weights=weights, **penalty)
 

@@ -9,7 +9,7 @@ from i2rl.inference import (
     LikelihoodChange,
     MovingWindow,
     PolicyWindow,
-    Report,
+    SessionInfo,
     airl_tabular,
     average_regret,
     fleet,
@@ -36,7 +36,7 @@ from i2rl.models import (
 
 
 def report(session=1, log_likelihood=0.0, gradient=0.0, weights=(0.0,)):
-    return Report(
+    return SessionInfo(
         session, log_likelihood, log_likelihood, gradient, 1, 1, True, 0.0, np.array(weights, float)
     )
 
@@ -101,7 +101,7 @@ def test_the_gradient_falls_as_sessions_agree(world):
     mdp, _ = world
     law = TrajectoryLaw(mdp, jnp.array([1.0, -1.0]), Sensor(), 8)
     many = sample_demonstration(jax.random.key(0), law, 400)
-    reports = run_sessions(me_i2rl(mdp, slack=0.0), many.sessions(20), key=jax.random.key(1)).reports
+    reports = run_sessions(me_i2rl(mdp, slack=0.0), many.sessions(20), key=jax.random.key(1)).infos
     assert reports[-1].gradient < 0.1 * reports[0].gradient
 
 
@@ -114,10 +114,10 @@ def test_the_learners_likelihood_is_that_of_everything_it_saw(world, statistic):
     learner = me_i2rl(mdp, slack=0.01, statistic=statistic)
     run = run_sessions(learner, many.sessions(10), key=jax.random.key(1))
     weights = run.state.weights
-    assert run.reports[-1].log_likelihood == pytest.approx(learner.log_likelihood(run.state, weights))
+    assert run.infos[-1].log_likelihood == pytest.approx(learner.log_likelihood(run.state, weights))
     if statistic == "counts":
         log_policy = np.asarray(soft_plan(mdp, reward_of(mdp, weights)).log_policy)
-        assert run.reports[-1].log_likelihood == pytest.approx(
+        assert run.infos[-1].log_likelihood == pytest.approx(
             log_policy[many.state, many.action].sum(1).mean()
         )
     better = learner.log_likelihood(run.state, weights)
@@ -156,7 +156,7 @@ def test_sessions_run_until_the_stream_ends_or_a_criterion_says_so(world, stream
     assert not whole.stopped
     short = run_sessions(learner, stream.sessions(), key=jax.random.key(0), stop=LikelihoodChange(np.inf))
     assert short.stopped
-    assert len(short.reports) == 2
+    assert len(short.infos) == 2
 
 
 def test_a_run_continued_from_a_state_equals_an_uninterrupted_one_to_the_bit(world, stream):
@@ -203,7 +203,7 @@ def test_whole_streams_in_one_program_learn_what_each_learner_alone_would(world,
     for i, key in enumerate(jax.random.split(jax.random.key(5), 2)):
         alone = run_sessions(learner, parts[i].sessions(), state=learner.init(key))
         assert np.allclose(states.weights[i], alone.state.weights, atol=1e-6)
-        expected = [r.log_likelihood for r in alone.reports]
+        expected = [r.log_likelihood for r in alone.infos]
         assert np.allclose(reports.log_likelihood[i], expected, atol=1e-8)
 
 
@@ -291,8 +291,8 @@ def begun(random_mdp, tmp_path):
 def test_a_stream_is_learned_once_however_it_is_given_again(begun, stream, options):
     run = begun(stream, **options)
     assert run.state.weights.tolist() == [11, 5]
-    assert [r.session for r in run.reports] == [4, 5]
-    assert begun(iter(FIVE)).reports == ()
+    assert [r.session for r in run.infos] == [4, 5]
+    assert begun(iter(FIVE)).infos == ()
 
 
 def test_what_no_session_learned_from_is_what_comes_next(begun):

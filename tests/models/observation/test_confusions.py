@@ -19,7 +19,7 @@ def noise() -> Confusions:
 
 
 def test_a_pair_is_reported_as_its_confusion_says(noise: Confusions):
-    table = np.exp(noise.reading.log_probabilities)
+    table = np.exp(noise.noise.log_probabilities)
     np.testing.assert_allclose(table.sum((2, 3)), 1)
     for s in range(2):
         assert table[s, A, s, A] == pytest.approx(0.8)
@@ -30,7 +30,7 @@ def test_a_pair_is_reported_as_its_confusion_says(noise: Confusions):
 
 def test_reports_occur_as_often_as_they_should(noise: Confusions):
     keys = jax.random.split(jax.random.key(0), 4000)
-    s, a = jax.vmap(lambda k: noise.reading.report(k, jnp.array(1), jnp.array(C)))(keys)
+    s, a = jax.vmap(lambda k: noise.noise.report(k, jnp.array(1), jnp.array(C)))(keys)
     assert (s == 1).all()
     share = float((a == A).mean())
     assert share == pytest.approx(0.4, abs=4 * np.sqrt(0.24 / 4000))
@@ -44,8 +44,8 @@ def test_which_confusion_explains_a_report(noise: Confusions):
 
 def test_composes_with_a_view(noise: Confusions):
     sensor = noise * Visibility(np.array([True, False]))
-    np.testing.assert_array_equal(sensor.presence, [1, 0])
-    assert sensor.reading is not None
+    np.testing.assert_array_equal(sensor.visibility, [1, 0])
+    assert sensor.noise is not None
 
 
 @pytest.mark.parametrize(

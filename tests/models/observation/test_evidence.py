@@ -90,7 +90,7 @@ def test_products_hide_and_confuse_at_once_in_either_order():
         np.testing.assert_allclose(probability(sensor, SEEN, 1, 1), seen)
         hidden = probability(sensor, HIDDEN)
         np.testing.assert_allclose(hidden[:, 0], 1 - VIEW * [0.5, 1, 1])
-    assert (Sensor() * noise).reading is noise
+    assert (Sensor() * noise).noise is noise
     with pytest.raises(ValueError, match="two observation models cannot be multiplied"):
         noise * noise
 

@@ -66,8 +66,8 @@ def test_agreement_is_how_often_a_predicate_is_reported_rightly(sensor):
 
 
 def test_what_injects_noise_is_what_explains_it():
-    reading = noise(1).reading
-    draw = jax.jit(jax.vmap(reading.report, in_axes=(0, None, None)))
+    model = noise(1).noise
+    draw = jax.jit(jax.vmap(model.report, in_axes=(0, None, None)))
     states, actions = draw(jax.random.split(jax.random.key(0), 20_000), 2, 1)
     counts = np.zeros((S, A))
     np.add.at(counts, (np.asarray(states), np.asarray(actions)), 1)
@@ -98,7 +98,7 @@ def test_a_predicate_of_reliability_one_half_says_nothing():
 soft_policy = jax.jit(lambda mdp, weights: soft_plan(mdp, reward_of(mdp, weights)).policy)
 
 
-def enumerated(mdp, weights, sensor, presence, codes):
+def enumerated(mdp, weights, sensor, visibility, codes):
     """Likelihood of one trajectory: the sum over everything that can have happened."""
     policy = np.asarray(soft_policy(mdp, weights))
     transition = np.zeros((S, A, S))
@@ -113,29 +113,29 @@ def enumerated(mdp, weights, sensor, presence, codes):
             if kind == SEEN:
                 reported = table[s, a] if seen_s == UNKNOWN else table[s, a][[seen_s]]
                 reported = reported if seen_a == UNKNOWN else reported[:, [seen_a]]
-                p *= presence[s] * reported.sum()
+                p *= visibility[s] * reported.sum()
             elif kind == HIDDEN:
-                p *= 1 - presence[s]
+                p *= 1 - visibility[s]
         total += p
     return np.log(total)
 
 
 @pytest.mark.parametrize("sensor", [noise(2), with_labels(2)], ids=["predicates", "labels"])
-@pytest.mark.parametrize("presence", [None, np.array([1.0, 0.0, 0.6, 1.0])])
+@pytest.mark.parametrize("visibility", [None, np.array([1.0, 0.0, 0.6, 1.0])])
 def test_likelihood_of_a_noisy_trajectory_hidden_in_places_is_that_of_enumeration(
-    random_mdp, presence, sensor
+    random_mdp, visibility, sensor
 ):
     mdp = random_mdp(7, n_states=S, n_actions=A, n_features=2, masked=True)
     weights = jnp.array([1.5, -2.0])
-    whole = sensor if presence is None else Visibility(presence) * sensor
+    whole = sensor if visibility is None else Visibility(visibility) * sensor
     rows = [
         [[SEEN, 1, 2], [SEEN, 3, 0], [SEEN, 0, 1]],
         [[SEEN, 1, UNKNOWN], [LOST, UNKNOWN, UNKNOWN], [SEEN, UNKNOWN, 1]],
     ]
-    if presence is not None:
+    if visibility is not None:
         rows.append([[SEEN, 2, 2], [HIDDEN, UNKNOWN, UNKNOWN], [SEEN, 0, 1]])
     law = TrajectoryLaw(mdp, weights, whole, 3)
-    view = np.ones(S) if presence is None else presence
+    view = np.ones(S) if visibility is None else visibility
     for row in rows:
         expected = enumerated(mdp, weights, sensor, view, row)
         assert float(law.log_prob(jnp.array(row))) == pytest.approx(expected, abs=1e-10)

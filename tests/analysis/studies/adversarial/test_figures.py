@@ -86,7 +86,7 @@ def hopper():
         scatters=scatters,
         belief=belief,
         frames=(frame_strip(CLEAN, robot, states, frames=3, seconds=0.03),),
-        settings={"rounds": 10},
+        settings={"iterations": 10},
     )
 
 

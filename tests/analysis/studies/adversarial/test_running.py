@@ -36,7 +36,7 @@ TRIALS, SESSIONS = 3, 2
 def told(tmp_path_factory):
     """The folder of a tiny report, and the JSON printed with it."""
     folder = tmp_path_factory.mktemp("report")
-    small = partial(patrol_results, trials=TRIALS, rounds=3)
+    small = partial(patrol_results, trials=TRIALS, iterations=3)
     command = ["run", "robust-airl", "--domain", "patrol", "--seeds", "1", "--sessions", str(SESSIONS)]
     # Next to nothing is computed: compilation is what takes time.
     jax.config.update("jax_disable_most_optimizations", True)

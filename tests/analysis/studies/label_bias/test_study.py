@@ -37,7 +37,7 @@ def _drawn_in_the_small_world(expert, blocked):
 @pytest.mark.parametrize("blocked", [True, False])
 def test_likelihoods_are_those_of_enumeration(expert, blocked):
     world = _small_world() if blocked else without_blocked_moves(_small_world())
-    mdp, steps, eta = world.mdp, _STEPS, _ETA
+    mdp, steps, rationality = world.mdp, _STEPS, _ETA
     drawn = _drawn_in_the_small_world(expert, blocked)
     reward = np.asarray(mdp.features) @ world.weights
     available, following = np.asarray(mdp.available), np.asarray(mdp.successors)[..., 0]
@@ -45,7 +45,7 @@ def test_likelihoods_are_those_of_enumeration(expert, blocked):
     for _ in range(300):
         q = np.where(available, reward + 0.8 * value[following], -np.inf)
         value = q.max(1)
-    boltzmann = np.exp(eta * q) / np.exp(eta * q).sum(1, keepdims=True)
+    boltzmann = np.exp(rationality * q) / np.exp(rationality * q).sum(1, keepdims=True)
     earned, likely = {}, {}
     for first, *actions in product(range(mdp.n_states), *[range(mdp.n_actions)] * steps):
         state, total, chance, open_way = first, 0.0, 1.0, True
@@ -64,7 +64,7 @@ def test_likelihoods_are_those_of_enumeration(expert, blocked):
         assert drawn.birl[i] == pytest.approx(np.log(likely[one]), abs=1e-9)
         path = np.asarray(drawn.states[i]), np.asarray(drawn.actions[i])
         advantages = (q - q.max(1, keepdims=True))[path].sum()
-        assert drawn.birl[i] == pytest.approx(eta * advantages - float(drawn.choice[i]), abs=1e-9)
+        assert drawn.birl[i] == pytest.approx(rationality * advantages - float(drawn.choice[i]), abs=1e-9)
 
 
 def test_experts_draw_from_their_laws():
@@ -118,8 +118,10 @@ def test_correlation_is_pearsons():
 
 @cache
 def _study():
-    settings = (Setting(), Setting(OPTIMAL, eta=10.0), Setting(MAXENT, blocked=False))
-    return label_bias.label_bias_study(_WORLDS, _TRAJECTORIES, seed=3, settings=settings, etas=(1.0, 10.0))
+    settings = (Setting(), Setting(OPTIMAL, rationality=10.0), Setting(MAXENT, blocked=False))
+    return label_bias.label_bias_study(
+        _WORLDS, _TRAJECTORIES, seed=3, settings=settings, rationalities=(1.0, 10.0)
+    )
 
 
 def test_maximum_entropy_has_no_label_bias():
@@ -149,7 +151,7 @@ def test_the_world_shown_is_the_median_one():
 
 
 def test_the_same_seed_gives_the_same_numbers():
-    few = {"settings": (Setting(),), "etas": (1.0,)}
+    few = {"settings": (Setting(),), "rationalities": (1.0,)}
     one, again, other = (
         label_bias.label_bias_study(_WORLDS, _TRAJECTORIES, seed=s, **few) for s in (0, 0, 1)
     )
@@ -165,7 +167,7 @@ def test_too_little_is_refused(given):
 
 def test_an_unknown_expert_is_refused():
     with pytest.raises(ValueError, match="expert must be"):
-        label_bias.label_bias_study(1, 4, settings=(Setting("lucky"),), etas=())
+        label_bias.label_bias_study(1, 4, settings=(Setting("lucky"),), rationalities=())
 
 
 @pytest.mark.usefixtures("small_pictures")
@@ -194,10 +196,10 @@ def test_the_report_says_where_the_correlation_is_significant():
     study = _study()
     n = study.per_world
 
-    def result(eta, *rho):
+    def result(rationality, *rho):
         rho = np.array(rho)
         p = np.array([label_bias.significance(r, n) for r in rho])
-        return label_bias.SettingResult(Setting(eta=eta), rho, p, np.ones_like(rho), rho)
+        return label_bias.SettingResult(Setting(rationality=rationality), rho, p, np.ones_like(rho), rho)
 
     told = label_bias_report._conditions(
         study._replace(
@@ -205,11 +207,11 @@ def test_the_report_says_where_the_correlation_is_significant():
             sweep={True: (result(3.0, -0.5, -0.4), result(4.0, 0.5, 0.1)), False: ()},
         )
     )
-    settings, etas = told.split("\n\n")
+    settings, rationalities = told.split("\n\n")
     assert "significant in at most half of the worlds: Boltzmann experts, eta 1 |" in settings
     assert settings.endswith("positive and significant in more than half: Boltzmann experts, eta 2.")
-    assert "significant in at most half of the worlds: 4 |" in etas
-    assert etas.endswith("negative and significant in more than half: 3.")
+    assert "significant in at most half of the worlds: 4 |" in rationalities
+    assert rationalities.endswith("negative and significant in more than half: 3.")
 
 
 @pytest.mark.parametrize(

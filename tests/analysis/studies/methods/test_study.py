@@ -53,9 +53,9 @@ def test_patrollers_turn_round_at_their_goals():
 
 
 def test_the_rate_is_the_smallest_that_is_as_good():
-    assert online_methods.chosen_rate([0.1, 1.0, 10.0], np.array([0.5, 0.895, 0.9])) == 1.0
-    assert online_methods.chosen_rate([10.0, 1.0], np.array([0.9, 0.9])) == 1.0
-    assert online_methods.chosen_rate([0.1, 1.0], np.array([0.5, 0.9])) == 1.0
+    assert online_methods.chosen_learning_rate([0.1, 1.0, 10.0], np.array([0.5, 0.895, 0.9])) == 1.0
+    assert online_methods.chosen_learning_rate([10.0, 1.0], np.array([0.9, 0.9])) == 1.0
+    assert online_methods.chosen_learning_rate([0.1, 1.0], np.array([0.5, 0.9])) == 1.0
 
 
 METHODS = ("Jin et al., features", "DARKO, goals", "LME-I2RL, seen")
@@ -63,7 +63,7 @@ METHODS = ("Jin et al., features", "DARKO, goals", "LME-I2RL, seen")
 
 @cache
 def small_study():
-    return online_methods.methods_study(2, sessions=8, runs=1, seed=1, rates=(0.3,), methods=METHODS)
+    return online_methods.methods_study(2, sessions=8, runs=1, seed=1, learning_rates=(0.3,), methods=METHODS)
 
 
 def test_every_method_is_measured_at_the_same_pairs():

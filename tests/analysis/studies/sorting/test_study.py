@@ -40,7 +40,7 @@ from i2rl.inference.learners.dpm import dpm_birl
 def small():
     """The quickest methods to compile, few and short trajectories."""
     return sorting_study.sorting_study(
-        2, (6,), runs=2, steps=20, methods=("dpm-birl", "em-mlirl"), belts=20, ways=3, seed=3
+        2, (6,), runs=2, steps=20, methods=("dpm-birl", "em-mlirl"), belts=20, n_components=3, seed=3
     )
 
 
@@ -65,18 +65,18 @@ def test_measures_are_those_of_the_fit_itself():
     key = sorting_study._stream(first, sorting, 2, study.counts, 20).key
     again = dpm_birl(sorting.mdp).fit(jax.random.fold_in(key, 6), study.demonstration)
     np.testing.assert_array_equal(again.assignments, found.assignments)
-    assert last.ways[0, -1] == len(set(again.assignments))
+    assert last.n_components[0, -1] == len(set(again.assignments))
     best = max(
         np.mean([renaming[a] == b for a, b in zip(again.assignments, study.labels, strict=True)])
-        for renaming in _renamings(again.n_clusters)
+        for renaming in _renamings(again.n_components)
     )
     assert last.accuracy[0, -1] == pytest.approx(best)
     assert (last.seconds > 0).all()
     assert (last.value_difference >= 0).all()
 
 
-def _renamings(ways):
-    return permutations(range(max(ways, 2)))
+def _renamings(n_components):
+    return permutations(range(max(n_components, 2)))
 
 
 def test_online_learner_is_judged_on_everything_by_what_it_knows_at_the_end():
@@ -89,7 +89,7 @@ def test_online_learner_is_judged_on_everything_by_what_it_knows_at_the_end():
 
     found = sorting_study._explained(sorting.mdp, Known, -1.5, mixed.demonstration)
     # The empty way is none; the largest comes first.
-    assert found.n_clusters == 2
+    assert found.n_components == 2
     assert found.objective == -6.0
     np.testing.assert_array_equal(found.assignments, 1 - mixed.labels)
     np.testing.assert_allclose(found.responsibilities.sum(1), 1)
@@ -98,8 +98,8 @@ def test_online_learner_is_judged_on_everything_by_what_it_knows_at_the_end():
 def test_a_behaviour_without_a_way_is_carried_out_as_its_trajectories_were_taken_for():
     found = small().results[0].found
     labels = np.array([0, 0, 0, 1])
-    one_way = found._replace(weights=np.eye(11)[:2], responsibilities=np.eye(2)[[0, 0, 1, 1]])
-    np.testing.assert_array_equal(sorting_study._behaviours_of(labels, one_way), np.eye(11)[:2])
+    one_component = found._replace(weights=np.eye(11)[:2], responsibilities=np.eye(2)[[0, 0, 1, 1]])
+    np.testing.assert_array_equal(sorting_study._behaviours_of(labels, one_component), np.eye(11)[:2])
     merged = found._replace(weights=np.eye(11)[:2], responsibilities=np.eye(2)[[1, 1, 1, 1]])
     np.testing.assert_array_equal(sorting_study._behaviours_of(labels, merged), np.eye(11)[[1, 1]])
 
@@ -110,7 +110,7 @@ def test_a_behaviour_without_a_way_is_carried_out_as_its_trajectories_were_taken
         ({"tasks": 4}, "tasks must be 2 .* or 3 .* got 4"),
         ({"counts": (8, 1)}, "2 tasks need at least 2 trajectories, one of each; got 1"),
         ({"counts": ()}, "at least one number of trajectories"),
-        ({"ways": 0}, "ways must be at least 1, got 0"),
+        ({"n_components": 0}, "ways must be at least 1, got 0"),
         ({"runs": 0}, "runs must be at least 1"),
         ({"sessions": 9, "counts": (4, 8)}, "at most the 8 trajectories, got 9"),
         ({"methods": ("gail",)}, "methods are mme-mtirl, .*got 'gail'"),
@@ -190,19 +190,19 @@ def test_figures_show_what_was_measured(theme):
     clusters = sorting_figures.clusters_plot(study, theme)
     drawn = [sum(len(x.get_xdata()) for x in panel.get_lines()) for panel in clusters.axes[:2]]
     assert drawn == [6, 6]
-    number = sorting_figures.ways_found_plot(study, theme)
+    number = sorting_figures.components_plot(study, theme)
     for panel, result in zip(number.axes, study.results, strict=True):
         shown = np.concatenate([x.get_offsets() for x in panel.collections])
-        expected = {(t, n) for t in range(1) for n in result.measures.ways[:, t]}
+        expected = {(t, n) for t in range(1) for n in result.measures.n_components[:, t]}
         assert {(int(x), int(y)) for x, y in shown} == expected
     times = sorting_figures.time_plot(study, theme).axes[0]
     assert {tick.get_text() for tick in times.get_xticklabels()} >= {"6"}
-    ways = sorting_figures.ways_diagram(study, theme)
-    assert len(ways.axes) == min(len(set(study.results[0].found.assignments)), 4)
-    assert ways.get_facecolor() == evd.get_facecolor()
+    n_components = sorting_figures.components_diagram(study, theme)
+    assert len(n_components.axes) == min(len(set(study.results[0].found.assignments)), 4)
+    assert n_components.get_facecolor() == evd.get_facecolor()
 
 
-@pytest.mark.parametrize("plot", ["clusters_plot", "ways_found_plot", "ways_diagram"])
+@pytest.mark.parametrize("plot", ["clusters_plot", "components_plot", "components_diagram"])
 def test_legend_and_small_print_of_a_single_method_fit_the_figure(plot):
     study = small()
     figure = getattr(sorting_figures, plot)(study._replace(results=study.results[:1]), LIGHT)
@@ -237,7 +237,7 @@ def test_command_writes_its_page(tmp_path, monkeypatch, page_faults):
     assert page_faults(page) == []
     assert "EM-MLIRL" in page
     assert page.count("<figure>") == 6
-    for name in ("clusters", "ways", "evd", "number", "time", "table"):
+    for name in ("clusters", "n_components", "evd", "number", "time", "table"):
         assert (tmp_path / f"{name}-dark.png").exists()
 
 

@@ -91,7 +91,7 @@ def learned(mdp: TabularMDP, noise: Confusions) -> Learner:
     assumed = Confusions(noise.reports, np.array([0.15, 0.15]))
     view = Visibility(np.arange(mdp.n_states) != 1)
     return robust_airl_with_learned_sensor(
-        mdp, assumed, view=view, rounds=40, learning_rate=1e-2, horizon=LENGTH
+        mdp, assumed, view=view, iterations=40, learning_rate=1e-2, horizon=LENGTH
     )
 
 
@@ -179,7 +179,7 @@ def _distance(log_policy, expert) -> float:
     ],
 )
 def test_knowing_what_the_expert_does_its_policy_is_recovered(mdp, expert, watched, make, options):
-    learner = make(mdp, Sensor(), rounds=300, occupancy="discounted", horizon=LENGTH, **options)
+    learner = make(mdp, Sensor(), iterations=300, occupancy="discounted", horizon=LENGTH, **options)
     state = _as_if_watched_for_ever(learner, mdp, expert)
     begun = _distance(state.log_policy, expert)
     for _ in range(4):
@@ -211,7 +211,7 @@ def sensor_learned(learned: Learner, sessions_of) -> TabularAdversarialState:
 def test_hidden_and_wrong_reports_cost_little_where_they_are_understood(
     mdp, expert, sensor, watched, sessions_of, sensor_learned
 ):
-    options = {"rounds": 40, "learning_rate": 1e-2, "horizon": LENGTH}
+    options = {"iterations": 40, "learning_rate": 1e-2, "horizon": LENGTH}
     known = sessions_of(robust_airl_tabular(mdp, sensor, **options))
     at_face_value = airl_tabular(mdp, **options)
     taken = sessions_of(at_face_value)
@@ -250,7 +250,7 @@ def test_a_session_with_sampled_truths_gives_the_state_that_the_next_one_takes(m
     after, report = jax.eval_shape(learner.session, state, watched[1].select(slice(0, 4)))
     same = jax.tree.map(lambda x, y: (x.shape, x.dtype) == (y.shape, y.dtype), state, after)
     assert all(jax.tree.leaves(same))
-    assert report.loss.shape == (TabularTraining().rounds,)
+    assert report.loss.shape == (TabularTraining().iterations,)
 
 
 # -- sessions -----------------------------------------------------------------------------------------
@@ -289,7 +289,7 @@ def test_reports_that_cannot_be_leave_the_learner_as_it_was(mdp, learned: Learne
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"rounds": 0}, "rounds must be at least 1"),
+        ({"iterations": 0}, "rounds must be at least 1"),
         ({"step": 0.0}, "step must be positive"),
         ({"entropy": 0.0}, "entropy"),
         ({"memory": 2.0}, "exponent"),

@@ -27,8 +27,8 @@ LABELS = np.repeat([0, 1], 8)
 
 def accuracy(assignments, labels=LABELS):
     found = np.asarray(assignments).argmax(1)
-    ways = range(np.shape(assignments)[1])
-    return max(np.mean(np.array(order)[found] == labels) for order in permutations(ways))
+    components = range(np.shape(assignments)[1])
+    return max(np.mean(np.array(order)[found] == labels) for order in permutations(components))
 
 
 class Tiny:

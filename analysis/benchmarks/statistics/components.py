@@ -1,13 +1,14 @@
 """Several ways of doing a task: online against batch, a way that comes late, hidden steps, experts who err.
 
-``python -m i2rl.analysis.benchmarks.statistics.ways`` measures MME-MTIRL on onion sorting (26 states, ``D =
-4``):
+``python -m i2rl.analysis.benchmarks.statistics.n_components`` measures MME-MTIRL on onion sorting (26 states,
+``D = 4``):
 
 - *online*: trajectories arrive in sessions; value difference and cumulative seconds against re-running the
   batch learner on everything so far at every session (each compiled before it is timed);
 - *late*: the third behaviour appears only in the last third of the sessions;
 - *hidden*: every step is hidden with probability one half;
-- *soft*: one or two experts who obey the soft model (true weights times a sharpness), ``price`` 0.5 and 1.
+- *soft*: one or two experts who obey the soft model (true weights times a sharpness), ``temperature`` 0.5 and
+  1.
 
 How many ways are found, value differences and run times beside the baselines: ``i2rl run sorting``.
 """
@@ -95,7 +96,7 @@ def online_against_batch(
         shares = assign_trajectories(
             sorting.mdp, None, weights, np.asarray(state.proportions)[present], demonstration
         )
-        result["online_ways"], result["batch_ways"] = int(present.sum()), fit.n_clusters
+        result["online_ways"], result["batch_ways"] = int(present.sum()), fit.n_components
         for name, learned, assignments in (
             ("online_evd", weights, shares.argmax(1)),
             ("batch_evd", fit.weights, fit.assignments),
@@ -107,7 +108,7 @@ def online_against_batch(
     return records[1:]
 
 
-def late_way(sorting: Sorting, sessions: int, size: int, seeds: Sequence[int]) -> list[dict[str, Any]]:
+def late_component(sorting: Sorting, sessions: int, size: int, seeds: Sequence[int]) -> list[dict[str, Any]]:
     """Two behaviours for two thirds of the sessions, three in the last third."""
     learner, records = mme_mtirl(sorting.mdp), []
     early = 2 * sessions // 3
@@ -128,7 +129,7 @@ def late_way(sorting: Sorting, sessions: int, size: int, seeds: Sequence[int]) -
             sorting.mdp, None, weights, np.asarray(state.proportions)[present], demonstration
         )
         records.append({
-            "seed": seed, "before": reports[early - 1].ways, "after": reports[-1].ways,
+            "seed": seed, "before": reports[early - 1].n_components, "after": reports[-1].n_components,
             "late_trajectories": int((labels == 2).sum()),
             "accuracy": assignment_accuracy(labels, shares.argmax(1)),
             "evd": expected_value_difference(
@@ -161,7 +162,7 @@ def hidden_steps(
         seen = hide(jax.random.fold_in(key, 1), whole, share)
         took, fit = timed(batch.fit, key, seen)
         records.append({
-            "seed": seed, "ways": fit.n_clusters, "seconds": took,
+            "seed": seed, "n_components": fit.n_components, "seconds": took,
             "accuracy": assignment_accuracy(labels, fit.assignments),
             "ari": adjusted_rand_index(labels, fit.assignments),
             "evd": expected_value_difference(
@@ -172,10 +173,10 @@ def hidden_steps(
 
 
 def soft_experts(
-    sorting: Sorting, sharpness: float, tasks: int, n: int, price: float, seeds: Sequence[int]
+    sorting: Sorting, sharpness: float, tasks: int, n: int, temperature: float, seeds: Sequence[int]
 ) -> list[dict[str, Any]]:
     """Experts who err as the model says they do."""
-    batch, records = batch_mme_mtirl(sorting.mdp, price=price), []
+    batch, records = batch_mme_mtirl(sorting.mdp, temperature=temperature), []
     labels: Int[np.ndarray, " n"] = np.repeat(np.arange(tasks), n // tasks)
     for seed in seeds:
         key = jax.random.key(seed)
@@ -187,8 +188,8 @@ def soft_experts(
         ]
         fit = batch.fit(key, Demonstration.from_codes(np.concatenate([np.asarray(c) for c in codes])))
         records.append({
-            "sharpness": sharpness, "tasks": tasks, "n": n, "price": price, "seed": seed,
-            "ways": fit.n_clusters, "accuracy": assignment_accuracy(labels, fit.assignments),
+            "sharpness": sharpness, "tasks": tasks, "n": n, "temperature": temperature, "seed": seed,
+            "n_components": fit.n_components, "accuracy": assignment_accuracy(labels, fit.assignments),
         })  # fmt: skip
     return records
 
@@ -203,7 +204,7 @@ def main() -> None:
 
     def record(name: str, runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
         results[name] = runs
-        publish("ways", results)
+        publish("n_components", results)
         return runs
 
     rows: list[tuple[Any, ...]] = []
@@ -223,7 +224,7 @@ def main() -> None:
     columns = ("stream", "all ways found, online / batch", "EVD online", "EVD batch", "s online", "s batch")
     print_table("Online against batch at every session", (*columns, "ratio"), rows)
 
-    runs = record("late", late_way(sorting, 18, 6, seeds))
+    runs = record("late", late_component(sorting, 18, 6, seeds))
     print_table(
         "A third way from the last third of 18 sessions of 6 on",
         ("two before", "three after", "mean accuracy", "mean EVD"),
@@ -240,7 +241,7 @@ def main() -> None:
             hidden_steps(sorting, tasks, n, 0.5, seeds[:10]),
         )
         rows.append((
-            f"{tasks} tasks, {n}", f"{sum(run['ways'] == tasks for run in runs)} of {len(runs)}",
+            f"{tasks} tasks, {n}", f"{sum(run['n_components'] == tasks for run in runs)} of {len(runs)}",
             float(np.mean([run["accuracy"] for run in runs])), min(run["accuracy"] for run in runs),
             float(np.mean([run["evd"] for run in runs])),
             float(np.median([run["seconds"] for run in runs])),
@@ -251,14 +252,14 @@ def main() -> None:
     rows = []
     for sharpness in (1.0, 3.0):
         for tasks in (1, 2):
-            for price in (0.5, 1.0):
+            for temperature in (0.5, 1.0):
                 runs = record(
-                    f"soft, sharpness {sharpness:g}, {tasks} tasks, price {price:g}",
-                    soft_experts(sorting, sharpness, tasks, 64, price, seeds[:10]),
+                    f"soft, sharpness {sharpness:g}, {tasks} tasks, price {temperature:g}",
+                    soft_experts(sorting, sharpness, tasks, 64, temperature, seeds[:10]),
                 )
                 rows.append((
-                    f"sharpness {sharpness:g}, {tasks} tasks, price {price:g}",
-                    " ".join(str(run["ways"]) for run in runs),
+                    f"sharpness {sharpness:g}, {tasks} tasks, price {temperature:g}",
+                    " ".join(str(run["n_components"]) for run in runs),
                     float(np.mean([run["accuracy"] for run in runs])),
                 ))  # fmt: skip
     print_table("Soft experts, 64 trajectories", ("experts", "ways found, by seed", "mean accuracy"), rows)
