@@ -289,8 +289,8 @@ def batch_mme_mtirl(
         rows = np.flatnonzero(demonstration.lengths)
         if len(rows) < n_components:
             warnings.warn(
-                f"`n_components` is {n_components}, but there are {len(rows)} trajectories: no more components "
-                "than that can be found",
+                f"`n_components` is {n_components}, but there are {len(rows)} trajectories: no more "
+                "components than that can be found",
                 stacklevel=2,
             )
         trajectories = _gather(mdp, sensor, demonstration)

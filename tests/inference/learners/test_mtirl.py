@@ -194,8 +194,8 @@ def test_streams_whose_first_session_is_empty_learn_from_the_next(sorting):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"n_components": 0}, "ways must be at least 1, got 0"),
-        ({"n_components": 2.5}, "ways must be a whole number, got 2.5"),
+        ({"n_components": 0}, "n_components must be at least 1, got 0"),
+        ({"n_components": 2.5}, "n_components must be a whole number, got 2.5"),
         ({"temperature": 0.0}, "price must be more than zero"),
         ({"ridge": -1.0}, "ridge must be finite and not negative"),
         ({"strength": float("nan")}, "strength must be finite and not negative, got nan"),
@@ -211,7 +211,7 @@ def test_senseless_settings_are_refused(sorting, learner, options, message):
 
 def test_fewer_trajectories_than_ways_are_said_and_not_crashed(sorting, batch):
     mixed = demonstrate_sorting(jax.random.key(0), sorting, (1, 1), STEPS)
-    with pytest.warns(UserWarning, match="4 ways were to be started from, but there are 2 trajectories"):
+    with pytest.warns(UserWarning, match="`n_components` is 4, but there are 2 trajectories"):
         found = batch.fit(jax.random.key(0), mixed.demonstration)
     assert 1 <= found.n_components <= 2
 
