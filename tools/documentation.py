@@ -94,10 +94,19 @@ def _page(room: str) -> str:
     directory = ROOT.joinpath(*room.split("."))
     options = "    options: {show_root_heading: false, members: false}\n"
     parts = [f"# {room} {{#i2rl.{room}}}\n", f"::: i2rl.{room}\n{options}"]
+    if (face := directory / "__init__.pyi").exists():
+        links = " · ".join(f"[`{name}`][i2rl.{room}.{name}]" for name in _public_names(face))
+        parts.append(f"`from i2rl.{room} import ...` gives: {links}\n")
     for path in sorted(directory.glob("*.py")):
         if not path.name.startswith("_") and _is_documented(path):
             parts.append(f"::: i2rl.{room}.{path.stem}\n")
     return "\n".join(parts)
+
+
+def _public_names(face: Path) -> list[str]:
+    """Return the names that a typed face re-exports."""
+    imports = [node for node in ast.parse(face.read_text()).body if isinstance(node, ast.ImportFrom)]
+    return sorted((alias.asname or alias.name for node in imports for alias in node.names), key=str.lower)
 
 
 def _is_documented(path: Path) -> bool:
