@@ -19,8 +19,7 @@ test: $(READY)
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	@mkdir -p build/lint && ln -sfn "$(CURDIR)" build/lint/i2rl
-	MYPYPATH=build/lint $(BIN)/mypy --config-file pyproject.toml -p i2rl.models -p i2rl.inference -p i2rl.domains -p i2rl.analysis
+	MYPYPATH=.editable $(BIN)/mypy --config-file pyproject.toml -p i2rl.models -p i2rl.inference -p i2rl.domains -p i2rl.analysis
 	$(BIN)/mypy --config-file pyproject.toml tools setup.py
 	I2RL_DOCS_WHOLE=false $(BIN)/mkdocs build --site-dir build/lint/docs
 
@@ -29,7 +28,6 @@ check: lint
 	@tests=$$($(BIN)/python tools/changed_tests.py $(BASE)) && \
 		if [ -n "$$tests" ]; then $(BIN)/pytest -q $$tests; else echo "No test belongs to what changed."; fi
 
-# Search needs a server: .venv/bin/mkdocs serve.
 docs: $(READY)
 	$(BIN)/mkdocs build
 	@echo "Open build/docs/index.html."

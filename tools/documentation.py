@@ -22,6 +22,9 @@ FOLDERS = ("models", "inference", "domains", "analysis")
 # Programs that nothing imports.
 WITHOUT_PAGES = ("analysis.benchmarks", "analysis.notebooks")
 MATH = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.S)
+# Bars are fences, which have no space inside.
+BAR = re.compile(r"(?:\\left|\\right)?\\([lr])(vert|Vert)")
+SIDES = {"l": "left", "r": "right"}
 OPERATOR = re.compile(r"<mi>(log|ln|exp)</mi>")
 CODE = re.compile(r"<(pre|code)\b.*?</\1>", re.S)
 
@@ -52,7 +55,7 @@ def on_page_content(content: str, page: Any, **kwargs: Any) -> str:
     """Replace TeX by MathML."""
 
     def translated(match: re.Match[str]) -> str:
-        tex = html.unescape(match[2]).strip()
+        tex = BAR.sub(lambda bar: f"\\{SIDES[bar[1]]}\\{bar[1]}{bar[2]}", html.unescape(match[2]).strip())
         display = "block" if match[1] == "div" else "inline"
         try:
             mathml = convert(tex, display=display)

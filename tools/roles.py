@@ -19,6 +19,7 @@ MATH_BLOCK = re.compile(
 )
 # A closing sentence of the docstring, which a parser would take for one more parameter.
 RAISES = re.compile(r"^Raises ``(?P<error>\w+)`` (?P<when>.+(?:\n.+)*)", re.M)
+SECTION = re.compile(r"^(?:Parameters|Attributes|Returns|Yields|Raises)\n-+\n(?:(?!.+\n-+$).*\n?)+", re.M)
 SEE_ALSO = re.compile(r"^See Also\n-+\n(?P<items>(?:[^\n]+\n?)+)", re.M)
 PACKAGE = "i2rl"
 WITHOUT_PAGES = ("i2rl.analysis.benchmarks", "i2rl.analysis.notebooks")
@@ -98,6 +99,7 @@ def as_markdown(text: str, index: Index, scope: griffe.Object) -> str:
     text = re.sub(r"^Fields\n------$", "Attributes\n----------", text, flags=re.M)
     text = RAISES.sub(_raises, text)
     text = SEE_ALSO.sub(lambda match: _see_also(match["items"], index, scope), text)
+    text = SECTION.sub(_plain_types, text)
     return ROLE.sub(lambda match: reference(match["target"], index, scope, short=match["short"] == "~"), text)
 
 
@@ -128,6 +130,15 @@ def _initialiser(new: Any) -> griffe.Function:
 def _raises(match: re.Match[str]) -> str:
     when = " ".join(match["when"].split())
     return f"Raises\n------\n{match['error']}\n    {when[:1].upper()}{when[1:]}"
+
+
+def _plain_types(match: re.Match[str]) -> str:
+    """Strip the names and types of a section of markup: they are shown as code."""
+    lines = (
+        line if line[:1].isspace() else ROLE.sub(r"\g<target>", line).replace("``", "")
+        for line in match[0].splitlines(keepends=True)
+    )
+    return "".join(lines)
 
 
 def _display(match: re.Match[str]) -> str:
