@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-FOLDERS = ("models", "inference", "domains", "analysis")
+FOLDERS = ("models", "inference", "domains", "analysis", "tools")
 
 
 def changed_files(base: str) -> list[Path]:
