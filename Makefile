@@ -4,8 +4,11 @@ VENV := .venv
 BIN := $(VENV)/bin
 READY := $(VENV)/.installed
 PEERS := .venv-peers
+# The branch that `make check` compares with.
+BASE ?= main
+export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: run test lint notebooks experts bench bench-peers clean
+.PHONY: run test lint check docs notebooks experts bench bench-peers clean
 
 run: $(READY)
 	$(BIN)/i2rl run patrol
@@ -16,8 +19,19 @@ test: $(READY)
 lint: $(READY)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	@mkdir -p build/lint && ln -sfn "$(CURDIR)" build/lint/i2rl
-	MYPYPATH=build/lint $(BIN)/mypy --config-file pyproject.toml -p i2rl.models -p i2rl.inference -p i2rl.domains -p i2rl.analysis
+	$(BIN)/lint-imports
+	MYPYPATH=.editable $(BIN)/mypy --config-file pyproject.toml -p i2rl.models -p i2rl.inference -p i2rl.domains -p i2rl.analysis
+	$(BIN)/mypy --config-file pyproject.toml tools setup.py
+	I2RL_DOCS_WHOLE=false $(BIN)/mkdocs build --site-dir build/lint/docs
+
+# The minute before a commit: lint, types, and the tests of what changed.
+check: lint
+	@tests=$$($(BIN)/python tools/changed_tests.py $(BASE)) && \
+		if [ -n "$$tests" ]; then $(BIN)/pytest -q $$tests; else echo "No test belongs to what changed."; fi
+
+docs: $(READY)
+	$(BIN)/mkdocs build
+	@echo "Open build/docs/index.html."
 
 # Executes the notebooks in place, at full size.
 notebooks: $(READY)
@@ -53,11 +67,12 @@ bench-peers: $(READY) $(PEERS)/.installed
 	$(BIN)/python -m i2rl.analysis.benchmarks.peers.ppo --peer-python $(PEERS)/bin/python
 	$(BIN)/python -m i2rl.analysis.benchmarks.peers.airl --peer-python $(PEERS)/bin/python
 
-$(READY): requirements.lock pyproject.toml
+$(READY): requirements.lock pyproject.toml setup.py tools/build_backend.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "i2rl needs Python 3.11 or later: make PYTHON=python3.11 ...")'
-	$(PYTHON) -m venv $(VENV)
-	$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.lock
-	$(BIN)/pip install --quiet --disable-pip-version-check --no-deps -e .
+	@echo "Installing requirements.lock and i2rl into $(VENV): about 1.8 GB, a minute or two."
+	@$(PYTHON) -m venv $(VENV)
+	@$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.lock
+	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps -e .
 	@touch $@
 
 # The peer needs its own environment: it pins old versions, and its tools need an old setuptools.
@@ -69,4 +84,4 @@ $(PEERS)/.installed: Makefile
 	@touch $@
 
 clean:
-	rm -rf $(VENV) $(PEERS) build report report-*
+	rm -rf $(VENV) $(PEERS) .editable build report report-*

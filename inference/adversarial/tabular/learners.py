@@ -93,12 +93,10 @@ def robust_airl_tabular(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> L
         The expert's process without its reward; discount below 1.
     sensor : Imperfection
         What may be hidden, misread, or both.
-    features : float ``[S, d]``, optional
-        What the networks know of a state; which state it is by default (one-hot).
-    network : mapping, optional
-        Hidden layers: ``reward`` and ``potential`` of AIRL (32; 32, 32), ``hidden`` of GAIL (64, 8).
     **options
-        Fields of :class:`TabularTraining`.
+        Fields of :class:`TabularTraining`; ``features``, float ``[S, d]``, the networks' view of a state
+        (one-hot by default); ``network``, a mapping of hidden layers: ``reward`` and ``potential`` of AIRL
+        (32; 32, 32), ``hidden`` of GAIL (64, 8).
 
     Returns
     -------
