@@ -18,8 +18,8 @@ import jax.numpy as jnp
 import numpy as np
 import pandas as pd
 from jax import lax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from ...inference.learners.lme import lme_i2rl
 from ...inference.programs.constraints import FeatureTarget

@@ -19,11 +19,11 @@ from .checks import counted, positive
 class Perception(NamedTuple):
     """What the bounds ask about perception.
 
-    ``draws`` used to estimate the observation model (``n_o``), its error ``epsilon_o``, the number of
+    ``observations`` used to estimate the observation model (``n_o``), its error ``epsilon_o``, the number of
     ``predicates`` (``|Psi|``), and the ``longest`` trajectory's steps (``L``).
     """
 
-    draws: float
+    observations: float
     epsilon_o: float
     predicates: int
     longest: int

@@ -98,7 +98,9 @@ def rimeo_constraint_bound(
     deltas = (
         failure_probability(size, epsilon, n_features),
         failure_probability(draws, epsilon_s, n_features),
-        failure_probability(perception.draws, perception.epsilon_o, n_features * perception.predicates),
+        failure_probability(
+            perception.observations, perception.epsilon_o, n_features * perception.predicates
+        ),
     )
     error = lemma.error + perception.longest * perception.predicates * perception.epsilon_o
     return Bound(
@@ -148,7 +150,7 @@ def _corrected(
     size: float, epsilon: float, distance: float, perception: Perception, n_features: int, more: tuple
 ) -> Bound:
     delta = failure_probability(size, epsilon, n_features)
-    delta_o = failure_probability(perception.draws, perception.epsilon_o, perception.predicates)
+    delta_o = failure_probability(perception.observations, perception.epsilon_o, perception.predicates)
     return Bound(
         "Lemma 4 (Lemma 8 of appendix E), corrected",
         "(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + d",
@@ -241,8 +243,8 @@ def perception_needed(
 def rimeo_no_regret(
     c: float,
     session_sizes: Int[np.ndarray, " T"] | Sequence[int],
-    session_samples: Int[np.ndarray, " T"] | Sequence[int],
-    session_reports: Int[np.ndarray, " T"] | Sequence[int],
+    session_draws: Int[np.ndarray, " T"] | Sequence[int],
+    session_observations: Int[np.ndarray, " T"] | Sequence[int],
     predicates: int,
     longest: int,
     n_features: int,
@@ -252,7 +254,7 @@ def rimeo_no_regret(
 
     The relaxation is spent in thirds on ``epsilon``, ``epsilon_s`` and ``L |Psi| epsilon_o`` (the
     dissertation leaves it open). ``session_sizes [T]`` are the trajectories of each session,
-    ``session_samples [T]`` the draws ``n_s`` in it, ``session_reports [T]`` what it adds to ``n_o``. What
+    ``session_draws [T]`` the draws ``n_s`` in it, ``session_observations [T]`` what it adds to ``n_o``. What
     :func:`~i2rl.analysis.bounds.theorems.no_regret` says of ``log T``, of products and of growing sessions
     holds of all three, see :func:`rimeo_no_regret_sizes`. Besides, ``phi_hat`` averages over sessions (Eq.
     6.9), of which the early ones were completed with the early models: for ``epsilon_{o,i}`` falling as ``1 /
@@ -263,10 +265,10 @@ def rimeo_no_regret(
     plain = no_regret(c, session_sizes, n_features, discount)
     i = np.arange(1, len(plain.average) + 1)
     third = c * (1 - discount) / i / 3
-    draws, reports = counted_sessions(session_samples), counted_sessions(session_reports)
+    draws, reports = counted_sessions(session_draws), counted_sessions(session_observations)
     if not len(draws) == len(reports) == len(i):
         raise ValueError(
-            f"{len(i)} session sizes, but {len(draws)} numbers of samples and {len(reports)} of reports"
+            f"{len(i)} session sizes, but {len(draws)} numbers of draws and {len(reports)} of observations"
         )
     epsilon_o = third / (longest * predicates)
     delta = 2 * n_features * (

@@ -23,7 +23,7 @@ from typer.core import TyperGroup
 from ..drawing.results import plain
 
 if TYPE_CHECKING:
-    from jax.typing import ArrayLike
+    from numpy.typing import ArrayLike
     from rich.console import Console
 
     from ...inference.journal.journal import JournalView, SessionRecord

@@ -10,7 +10,8 @@ import math
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
 
 from ...models.networks.environment import Environment
 from ...models.networks.modules import ActionSpace

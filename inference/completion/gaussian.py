@@ -26,7 +26,8 @@ import numpy as np
 from jax import lax
 from jax.scipy.linalg import solve_triangular
 from jax.scipy.stats import norm
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from ...models.inputs.arguments import as_key, described
 from ...models.observation.recordings import (

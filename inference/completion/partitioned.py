@@ -14,7 +14,7 @@ its report's truths, and moves between truths are weighed by the dynamics with a
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -22,7 +22,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 from scipy import ndimage, sparse
 
 from ...models.laws.chain import Filtered, filter_all, sample_backward, smooth_all
@@ -401,12 +402,12 @@ def partition_truth(
     return PartitionTruth(partition(dynamics, low, high, n_actions, parts=parts, points=points), draws)
 
 
-def _box(low: ArrayLike | Sequence[float], high: ArrayLike | Sequence[float]) -> Box:
+def _box(low: ArrayLike, high: ArrayLike) -> Box:
     box = Box(jnp.asarray(low, float), jnp.asarray(high, float))
     if box.low.ndim != 1 or box.low.shape != box.high.shape or not (box.low < box.high).all():
-        raise ValueError(f"low and high must be [d] with low below high, got {low} and {high}")
+        raise ValueError(f"low and high must be [d] with low below high, got {box.low} and {box.high}")
     if not (jnp.isfinite(box.low) & jnp.isfinite(box.high)).all():
-        raise ValueError(f"low and high must be finite, got {low} and {high}")
+        raise ValueError(f"low and high must be finite, got {box.low} and {box.high}")
     return box
 
 

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
 
 from ...models.observation.demonstration import SEEN, Demonstration, DemonstrationError
 from ...models.observation.evidence import (

@@ -19,8 +19,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from ...models.inputs.arguments import as_key
 from ...models.observation.demonstration import SEEN, Demonstration, DemonstrationError
@@ -351,7 +351,7 @@ def initial_logits(psi: np.ndarray, start: ArrayLike) -> Float[Array, " J"]:
         )
     p = np.broadcast_to(p, (len(psi),))
     if not ((p > 0) & (p < 1)).all():
-        raise ValueError(f"start is how often predicates are right, between 0 and 1, got {start}")
+        raise ValueError(f"start is how often predicates are right, between 0 and 1, got {p.tolist()}")
     others = np.array([max(len(np.unique(values)) - 1, 1) for values in psi])
     return jnp.asarray(np.log(p) - np.log1p(-p) + np.log(others))
 

@@ -15,8 +15,8 @@ import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jax import lax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 from numpyro.infer import NUTS
 from numpyro.infer.util import potential_energy
 

@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 import casadi as ca
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
 from scipy import sparse
 
 from ...models.process.mdp import TabularMDP

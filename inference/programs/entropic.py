@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jax.scipy.special import xlogy
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 # The equation for the largest proportion has one or two solutions that are maxima, looked for on this grid.
 _GRID = 64

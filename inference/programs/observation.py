@@ -22,8 +22,8 @@ from typing import Any, NamedTuple
 
 import casadi as ca
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 from scipy.sparse import csgraph
 
 from ...models.observation.agreement import PredicateClasses, agreement_patterns, predicate_classes

@@ -8,8 +8,8 @@ from typing import NamedTuple
 import cvxpy as cp
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import reachable_states, require_discounted

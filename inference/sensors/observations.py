@@ -18,8 +18,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from ...models.observation.agreement import agreement_patterns
 from ...models.observation.demonstration import HIDDEN, SEEN, UNKNOWN, Demonstration

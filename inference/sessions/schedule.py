@@ -16,8 +16,8 @@ from typing import Any, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 # Harmonic by name: type checkers do not see that a named tuple can be called.
 Schedule: TypeAlias = "float | Harmonic | Callable[[Int[Array, '']], ArrayLike]"

@@ -15,8 +15,8 @@ import jax
 import numpy as np
 import pymc as pm
 import pytensor.tensor as pt
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from ..inputs.arguments import as_key
 from ..observation.agreement import PredicateClasses, ReportedMatches, predicate_classes

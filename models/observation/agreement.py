@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from .evidence import FeatureNoise, checked_predicates
 

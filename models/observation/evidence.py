@@ -14,8 +14,8 @@ from typing import Any, NamedTuple, Protocol
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from ..inputs.arguments import as_key, concrete, described, is_traced, rebuilt_unchecked
 from ..inputs.probabilities import normalised, sum_tolerance

@@ -147,21 +147,26 @@ def noise_study(
     jobs = [
         *((first, name, 0.0) for name in (CLEAN, NOISY, ROBUST)),
         *((first, name, 1.0) for name in (CLEAN, NOISY, ROBUST, LME, LEARNED)),
-        *((level, name, memory) for level in others for memory in (0.0, 1.0) for name in (NOISY, ROBUST)),
+        *(
+            (level, name, forgetting)
+            for level in others
+            for forgetting in (0.0, 1.0)
+            for name in (NOISY, ROBUST)
+        ),
         *((first, name, 0.0) for name in (LEARNED, LOGITS, GIBBS)),
     ]  # fmt: skip
     streams_of = cache(partial(noisy_streams, patrol, runs=runs, sessions=sessions))
-    for level, name, memory in jobs:
+    for level, name, forgetting in jobs:
         everything = level == first and name not in (GIBBS, LOGITS)
         count, tried = (runs, trials) if everything else (min(few, runs), 0)
         streams = streams_of(level)
         make, seen = noise_methods(streams, patrol)[name]
-        learner = make(memory=memory, iterations=iterations)
+        learner = make(forgetting=forgetting, iterations=iterations)
         own = Demonstration(*(x[:count] for x in seen))
 
         def action(
             name: str = name,
-            memory: float = memory,
+            forgetting: float = forgetting,
             level: float = level,
             learner: Learner = learner,
             own: Demonstration = own,
@@ -171,14 +176,14 @@ def noise_study(
             found, took = _timed(patrol, learner, own)
             success = success_rates(patrol, found.policies, tried) if tried else np.zeros(0)
             return {
-                "name": name, "level": level, "memory": memory, "seconds": took,
+                "name": name, "level": level, "forgetting": forgetting, "seconds": took,
                 "final": float(found.accuracy[:, -LAST:].mean()), "trials": tried,
                 "success mean": float(success.mean()) if tried else None,
                 "pairs": pairs.tolist(), "accuracy": found.accuracy.round(5).tolist(),
                 "success": success.tolist(), "noise": found.noise.round(5).tolist(),
             }  # fmt: skip
 
-        file.measure("noise", f"{name}, {level:g}, memory {memory:g}", action)
+        file.measure("noise", f"{name}, {level:g}, memory {forgetting:g}", action)
 
 
 def view_study(file: _File, *, runs: int, sessions: int, iterations: int) -> None:
@@ -191,27 +196,27 @@ def view_study(file: _File, *, runs: int, sessions: int, iterations: int) -> Non
         visibility = patrol.visibility(view)
         learners = [
             (LME, 1.0, lme_i2rl(mdp, visibility)),
-            (GAIL, 0.0, gail_tabular(mdp, memory=0.0, **options)),
-            (GAIL, 1.0, gail_tabular(mdp, memory=1.0, **options)),
-            (ROBUST_GAIL, 1.0, robust_gail_tabular(mdp, visibility, memory=1.0, **options)),
+            (GAIL, 0.0, gail_tabular(mdp, forgetting=0.0, **options)),
+            (GAIL, 1.0, gail_tabular(mdp, forgetting=1.0, **options)),
+            (ROBUST_GAIL, 1.0, robust_gail_tabular(mdp, visibility, forgetting=1.0, **options)),
         ]
-        for name, memory, learner in learners:
+        for name, forgetting, learner in learners:
 
             def action(
                 name: str = name,
-                memory: float = memory,
+                forgetting: float = forgetting,
                 view: int = view,
                 learner: Learner = learner,
                 seen: Demonstration = seen,
             ) -> dict[str, Any]:
                 found, took = _timed(patrol, learner, seen)
                 return {
-                    "name": name, "view": view, "memory": memory, "seconds": took,
+                    "name": name, "view": view, "forgetting": forgetting, "seconds": took,
                     "final": float(found.accuracy[:, -1].mean()),
                     "accuracy": found.accuracy.round(5).tolist(),
                 }  # fmt: skip
 
-            file.measure("view", f"{name}, {view} %, memory {memory:g}", action)
+            file.measure("view", f"{name}, {view} %, memory {forgetting:g}", action)
 
 
 def _print(results: Mapping[str, Any]) -> None:

@@ -5,9 +5,9 @@ sessions of 32 to 128 pairs. Moving forward is reported as turning left, and tur
 states are never wrong. All is exact: the posterior of the truth behind a report, and the generator's plan.
 
 :func:`patrol_results` is the study behind ``i2rl run robust-airl --domain patrol``. Networks alone are
-carried from session to session there, as in the dissertation (``memory`` of 0): with the statistic of earlier
-sessions that these learners keep by default, noise of 5 % costs next to nothing and there is nothing to
-recover. :mod:`~i2rl.analysis.benchmarks.statistics.adversarial_patrol` measures both.
+carried from session to session there, as in the dissertation (``forgetting`` of 0): with the statistic of
+earlier sessions that these learners keep by default, noise of 5 % costs next to nothing and there is nothing
+to recover. :mod:`~i2rl.analysis.benchmarks.statistics.adversarial_patrol` measures both.
 """
 
 from __future__ import annotations
@@ -229,7 +229,7 @@ def patrol_results(
     level, patrol = noise * LEVEL, instance(2)
     streams = noisy_streams(patrol, level, seeds, sessions)
     learners = {
-        name: make(memory=0.0, iterations=iterations)
+        name: make(forgetting=0.0, iterations=iterations)
         for name, make in noise_learners(patrol, streams.sensor).items()
     }
     learners[CLEAN] = learners[NOISY]  # compiled once

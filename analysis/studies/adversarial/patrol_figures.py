@@ -52,9 +52,9 @@ def noise_curves(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     figure.get_layout_engine().set(wspace=0.05)  # type: ignore[union-attr, call-arg]
     panels = figure.subplots(1, 2, sharey=True)
     least = 0.9
-    for panel, (memory, title) in zip(panels, _MEMORY.items(), strict=True):
+    for panel, (forgetting, title) in zip(panels, _MEMORY.items(), strict=True):
         for name in (CLEAN, NOISY, ROBUST, LEARNED, LME):
-            one = _noise(results, name, 0.05 if name == CLEAN else level, 1.0 if name == LME else memory)
+            one = _noise(results, name, 0.05 if name == CLEAN else level, 1.0 if name == LME else forgetting)
             if one is None:
                 continue
             style = method_styles(theme, [name])[name]
@@ -85,19 +85,19 @@ def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     figure.get_layout_engine().set(wspace=0.06)  # type: ignore[union-attr, call-arg]
     left, right = figure.subplots(1, 2)
     levels = sorted({r["level"] for r in results["noise"].values() if "level" in r})
-    for i, (name, memory) in enumerate(((NOISY, 0.0), (ROBUST, 0.0), (NOISY, 1.0), (ROBUST, 1.0))):
-        found = [(x, _noise(results, name, x, memory)) for x in levels]
+    for i, (name, forgetting) in enumerate(((NOISY, 0.0), (ROBUST, 0.0), (NOISY, 1.0), (ROBUST, 1.0))):
+        found = [(x, _noise(results, name, x, forgetting)) for x in levels]
         values = [(x, interval(_last(one))) for x, one in found if one is not None]
         x, (mean, half) = np.array([x for x, _ in values]), np.array([v for _, v in values]).T
-        label = _with_memory(name, memory)
+        label = _with_memory(name, forgetting)
         style = method_styles(theme, [label])[label]
         at = x + (i - 1.5) * 0.0025
         left.vlines(at, mean - half, np.minimum(mean + half, 1.0), color=style["color"], linewidth=1.4)
         left.plot(at, mean, label=label, linewidth=1.6, markersize=6, **style)
-    for memory, dash in ((0.0, (0, (2, 2))), (1.0, (0, (7, 2)))):
-        clean = _noise(results, CLEAN, level, memory)
+    for forgetting, dash in ((0.0, (0, (2, 2))), (1.0, (0, (7, 2)))):
+        clean = _noise(results, CLEAN, level, forgetting)
         if clean is not None:
-            label = _with_memory(CLEAN, memory)
+            label = _with_memory(CLEAN, forgetting)
             left.axhline(_last(clean).mean(), color=theme.ink, linewidth=1.2, linestyle=dash, label=label)
     dress(left, theme, title=f"Accuracy, mean of the last {LAST} sessions", x="probability of a misreport")
     left.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
@@ -119,7 +119,7 @@ def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
 
 
 def _breaches(axes: Axes, results: Results, theme: Theme, level: float) -> None:
-    rows = [(name, memory) for memory in (0.0, 1.0) for name in (CLEAN, NOISY, ROBUST, LEARNED)]
+    rows = [(name, forgetting) for forgetting in (0.0, 1.0) for name in (CLEAN, NOISY, ROBUST, LEARNED)]
     rows.append((LME, 1.0))
     there = [(n, m, one) for n, m in rows if (one := _noise(results, n, level, m)) and one["success"]]
     named = [(n if n == LME else _with_memory(n, m), np.array(one["success"])) for n, m, one in there]
@@ -140,8 +140,8 @@ def _breaches(axes: Axes, results: Results, theme: Theme, level: float) -> None:
     axes.set_xlim(0, 1.02)
 
 
-def _with_memory(name: str, memory: float) -> str:
-    return f"{name}, memory" if memory else name
+def _with_memory(name: str, forgetting: float) -> str:
+    return f"{name}, memory" if forgetting else name
 
 
 def _last(one: Mapping[str, Any]) -> Float[np.ndarray, " R"]:
@@ -160,10 +160,10 @@ def view_curves(results: Results, theme: Theme, gail_memory: float = 0.0) -> Fig
     figure.get_layout_engine().set(wspace=0.04, hspace=0.06)  # type: ignore[union-attr, call-arg]
     panels = figure.subplots(2, len(methods), sharex=True, sharey="row")
     views = sorted({r["view"] for r in results["view"].values()}, reverse=True)
-    for column, (name, memory) in enumerate(methods):
-        full = np.array(_required(_view(results, name, 100, memory))["accuracy"])
+    for column, (name, forgetting) in enumerate(methods):
+        full = np.array(_required(_view(results, name, 100, forgetting))["accuracy"])
         for i, view in enumerate(views):
-            one = _view(results, name, view, memory)
+            one = _view(results, name, view, forgetting)
             if one is None:
                 continue
             accuracy = np.array(one["accuracy"])
@@ -174,7 +174,7 @@ def view_curves(results: Results, theme: Theme, gail_memory: float = 0.0) -> Fig
                 lost = (full - accuracy) / full
                 _draw_mean(panels[1, column], style, f"{view} % in view", x, lost)
         # A line for each part of a name, or the titles of neighbours meet.
-        told = name if name == LME else _with_memory(name, memory).replace(", ", "\n", 1)
+        told = name if name == LME else _with_memory(name, forgetting).replace(", ", "\n", 1)
         dress(panels[0, column], theme, title=told)
         dress(panels[1, column], theme, x="trajectories seen")
         panels[1, column].axhline(0, color=theme.muted, linewidth=0.9)
@@ -210,12 +210,12 @@ def write_figures(results: Results, folder: Path | str) -> list[Path]:
 # -- parts --------------------------------------------------------------------------------------------
 
 
-def _noise(results: Results, name: str, level: float, memory: float) -> Mapping[str, Any] | None:
-    return results["noise"].get(f"{name}, {level:g}, memory {memory:g}")
+def _noise(results: Results, name: str, level: float, forgetting: float) -> Mapping[str, Any] | None:
+    return results["noise"].get(f"{name}, {level:g}, memory {forgetting:g}")
 
 
-def _view(results: Results, name: str, view: int, memory: float) -> Mapping[str, Any] | None:
-    return results["view"].get(f"{name}, {view} %, memory {memory:g}")
+def _view(results: Results, name: str, view: int, forgetting: float) -> Mapping[str, Any] | None:
+    return results["view"].get(f"{name}, {view} %, memory {forgetting:g}")
 
 
 def _required(one: Mapping[str, Any] | None) -> Mapping[str, Any]:

@@ -20,7 +20,8 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float, Int
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
 
 from ....domains.robots.experts import load_demonstrations
 from ....domains.robots.simulation import LEVELS, Perturbed, Trajectories, graded_mix, simulate

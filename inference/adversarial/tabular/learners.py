@@ -21,8 +21,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
 
 from ....extras import required
 from ....models.inputs.arguments import as_key
@@ -323,7 +323,7 @@ def _learner(
         def round_(carry: tuple, key: Array) -> tuple:
             network, memory, log_policy, values, confusions = carry
             completed, confusions = complete(key, network, log_policy, confusions)
-            expert = blend(state.statistic, summarised(completed), how.memory)
+            expert = blend(state.statistic, summarised(completed), how.forgetting)
             sides = Sides(expert, completed, generated(mdp, log_policy, expert.starts))
             (network, memory), met = cast(
                 tuple, lax.scan(partial(descend, sides, log_policy), (network, memory), None, how.updates)
@@ -338,7 +338,7 @@ def _learner(
         carry, met = cast(tuple, lax.scan(round_, begun, keys[2:]))
         network, memory, log_policy, values, confusions = carry
         completed, confusions = complete(keys[1], network, log_policy, confusions)
-        kept = blend(state.statistic, summarised(completed), how.memory)
+        kept = blend(state.statistic, summarised(completed), how.forgetting)
         own = jnp.sum(completed.log_likelihood)
         parts = (network, memory, log_policy, values, kept, confusions, state.session + 1, keys[0])
         # A report that cannot be must not spoil what was learned (a fleet raises nothing).

@@ -31,7 +31,7 @@ class TabularTraining(NamedTuple):
     step : float
         Of the generator, see :func:`~i2rl.inference.adversarial.tabular.discriminator.proximal_plan`;
         infinite for a plan afresh.
-    memory : float
+    forgetting : float
         Exponent of the current session's share in the statistic of the expert's transitions: 1 counts all
         sessions alike, less forgets slowly, 0 keeps nothing.
     occupancy : {"visited", "discounted"}
@@ -48,7 +48,7 @@ class TabularTraining(NamedTuple):
     learning_rate: float = 3e-3
     entropy: float = 1.0
     step: float = np.inf
-    memory: float = 1.0
+    forgetting: float = 1.0
     occupancy: str = "visited"
     average: str = "log probabilities"
     horizon: int = 16
@@ -65,12 +65,12 @@ class TabularTraining(NamedTuple):
             raise ValueError(
                 f"the entropy's worth must be positive, or 0 with a finite step, got {self.entropy}"
             )
-        if not 0 <= self.memory <= 1:
-            raise ValueError(f"memory is an exponent in [0, 1], got {self.memory}")
+        if not 0 <= self.forgetting <= 1:
+            raise ValueError(f"memory is an exponent in [0, 1], got {self.forgetting}")
         for name, known in (("occupancy", OCCUPANCIES), ("average", AVERAGES)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} is one of {', '.join(known)}, got {getattr(self, name)!r}")
-        if self.average == "logits" and self.memory > 0:
+        if self.average == "logits" and self.forgetting > 0:
             raise ValueError("the average of logits is over a session's own steps: memory must be 0")
         return self
 
@@ -84,7 +84,7 @@ class TabularAdversarialState(NamedTuple):
     optimiser : its optimiser's state
     log_policy : float ``[S, A]``, the generator
     values : float ``[S]``, planning's warm start
-    statistic : TransitionStatistic, of the expert so far (what ``memory`` leaves of it)
+    statistic : TransitionStatistic, of the expert so far (what ``forgetting`` leaves of it)
     confusions : ConfusionStatistic, or empty where the sensor is given
     session : int
     key : random key

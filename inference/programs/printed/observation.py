@@ -11,8 +11,8 @@ from typing import NamedTuple
 
 import casadi as ca
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Float
+from numpy.typing import ArrayLike
 
 from ....models.observation.agreement import predicate_classes, reported_matches
 from ..constraints import ProgramNotSolved

@@ -90,7 +90,7 @@ def test_reports_that_say_nothing_teach_nothing_under_the_learners_own_weights()
     """Theorem 6 as printed is false for them: its bound falls with data, the loss does not."""
     setting = shift_setting(0.5, 4)
     nothing = ignorance_gap(setting.mdp, setting.weights)
-    perception = Perception(samples=10**9, epsilon_o=1e-4, predicates=3, longest=4)
+    perception = Perception(observations=10**9, epsilon_o=1e-4, predicates=3, longest=4)
     theorem = rimeo_confidence(10**5, 10**5, 0.01, 0.01, perception, 2, 0.8)
     assert theorem.confidence > 0.99
     assert theorem.error < nothing / 2

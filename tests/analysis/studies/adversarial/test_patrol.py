@@ -62,15 +62,18 @@ def results():
 
     noise = {}
     for level in LEVELS:
-        for memory in (0.0, 1.0):
+        for forgetting in (0.0, 1.0):
             for name, top in ((CLEAN_INPUT, 0.97), (NOISY, 0.97 - level / 4), (ROBUST, 0.96)):
-                noise[f"{name}, {level:g}, memory {memory:g}"] = {
+                noise[f"{name}, {level:g}, memory {forgetting:g}"] = {
                     "level": level, "accuracy": curve(top), "success": rng.random(5).tolist(),
                     "pairs": list(range(50, 1050, 50)),
                 }  # fmt: skip
     view = {
-        f"{name}, {percent} %, memory {memory:g}": {"view": percent, "accuracy": curve(0.5 + percent / 250)}
-        for name, memory in ((GAIL, 0.0), (ROBUST_GAIL, 1.0), (LME, 1.0))
+        f"{name}, {percent} %, memory {forgetting:g}": {
+            "view": percent,
+            "accuracy": curve(0.5 + percent / 250),
+        }
+        for name, forgetting in ((GAIL, 0.0), (ROBUST_GAIL, 1.0), (LME, 1.0))
         for percent in VIEWS
     }
     return {"noise": noise, "view": view}

@@ -292,7 +292,7 @@ def test_reports_that_cannot_be_leave_the_learner_as_it_was(mdp, learned: Learne
         ({"iterations": 0}, "rounds must be at least 1"),
         ({"step": 0.0}, "step must be positive"),
         ({"entropy": 0.0}, "entropy"),
-        ({"memory": 2.0}, "exponent"),
+        ({"forgetting": 2.0}, "exponent"),
         ({"occupancy": "seen"}, "occupancy is one of visited, discounted"),
         ({"average": "logits"}, "memory must be 0"),
         ({"speed": 1}, "no option 'speed'"),
