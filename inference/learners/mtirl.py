@@ -395,7 +395,7 @@ def _program(
     if np.isnan(tolerance):
         raise ValueError("tolerance must be a number of nats, got nan")
     if temperature == 0:
-        raise ValueError("price must be more than zero: every trajectory would be a way of its own")
+        raise ValueError("temperature must be more than zero: every trajectory would be a way of its own")
     reachable = jnp.asarray(reachable_states(mdp))
     return MixtureProgram(mdp, reachable, strength, slack, ridge, temperature, iterations, tolerance)
 

@@ -487,7 +487,7 @@ def _learner(
     if iterations < 1:
         raise ValueError(f"a session needs at least one iteration, got {iterations}")
     if not 0 < forgetting <= 1:
-        raise ValueError(f"memory is an exponent in (0, 1], got {forgetting}")
+        raise ValueError(f"forgetting is an exponent in (0, 1], got {forgetting}")
     mdp = method.mdp
     parts = _Alternation(method, perception, forgetting)
 

@@ -305,7 +305,7 @@ class MinMaxProgram:
             if not (np.isfinite(value) & (np.asarray(value) >= 0)).all():
                 raise ValueError(f"{name} must be finite and not negative, got {value}")
         if not (np.isfinite(temperature) and temperature > 0):
-            raise ValueError(f"price must be finite and more than zero, got {temperature}")
+            raise ValueError(f"temperature must be finite and more than zero, got {temperature}")
         return _Penalties(
             float(strength), float(temperature), np.broadcast_to(slack, (self.mdp.n_features,)), float(ridge)
         )

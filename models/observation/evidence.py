@@ -41,7 +41,7 @@ class _Composable:
     def __mul__(self: AnySensor, other: AnySensor) -> Sensor:
         other = as_sensor(other)
         if self.noise is not None and other.noise is not None:
-            raise ValueError("a sensor has one reading: two observation models cannot be multiplied")
+            raise ValueError("a sensor has one noise: two observation models cannot be multiplied")
         if self.visibility is None or other.visibility is None:
             visibility = self.visibility if other.visibility is None else other.visibility
         else:
@@ -77,7 +77,7 @@ class Sensor(_Composable, _SensorFields):  # type: ignore[misc]
             )
         if noise is not None and not hasattr(noise, "log_likelihood"):
             if not _is_sensor(noise):
-                raise TypeError(f"reading must be an ObservationModel or None; got {described(noise)}")
+                raise TypeError(f"noise must be an ObservationModel or None; got {described(noise)}")
             noise = noise.noise
         return super().__new__(cls, visibility, noise)
 

@@ -66,12 +66,12 @@ class TabularTraining(NamedTuple):
                 f"the entropy's worth must be positive, or 0 with a finite step, got {self.entropy}"
             )
         if not 0 <= self.forgetting <= 1:
-            raise ValueError(f"memory is an exponent in [0, 1], got {self.forgetting}")
+            raise ValueError(f"forgetting is an exponent in [0, 1], got {self.forgetting}")
         for name, known in (("occupancy", OCCUPANCIES), ("average", AVERAGES)):
             if getattr(self, name) not in known:
                 raise ValueError(f"{name} is one of {', '.join(known)}, got {getattr(self, name)!r}")
         if self.average == "logits" and self.forgetting > 0:
-            raise ValueError("the average of logits is over a session's own steps: memory must be 0")
+            raise ValueError("the average of logits is over a session's own steps: forgetting must be 0")
         return self
 
 

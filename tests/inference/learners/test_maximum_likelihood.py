@@ -113,11 +113,13 @@ def test_padding_rows_and_identical_trajectories(mdp, trajectories):
 
 def test_bad_input_is_named(mdp, trajectories):
     em = em_mlirl(mdp, n_components=2, rationality=ETA, iterations=3)
-    with pytest.raises(ValueError, match="2 clusters were asked for, but the demonstration has 1 trajectory"):
+    with pytest.raises(
+        ValueError, match="2 components were asked for, but the demonstration has 1 trajectory"
+    ):
         em.fit(jax.random.key(0), trajectories.select([0]))
-    with pytest.raises(ValueError, match="clusters must be positive, got 0"):
+    with pytest.raises(ValueError, match="n_components must be positive, got 0"):
         em_mlirl(mdp, n_components=0)
-    with pytest.raises(ValueError, match="eta must be positive, got -1"):
+    with pytest.raises(ValueError, match="rationality must be positive, got -1"):
         mlirl(jax.random.key(0), mdp, trajectories, rationality=-1)
     hidden = Demonstration.from_steps([[(0, 0)], ["hidden"]], mdp)
     with pytest.raises(DemonstrationError, match="trajectory 1, step 0 is hidden"):

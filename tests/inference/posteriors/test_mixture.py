@@ -215,7 +215,7 @@ def test_partitions_and_weights_agree_with_enumeration(idata, exact):
 def test_samplers_agree_on_what_does_not_depend_on_labels(posteriors):
     compared = compare(0, **posteriors)
     names = {c.name for c in compared}
-    assert {"2 ways", "concentration", "largest proportion"} < names
+    assert {"2 components", "concentration", "largest proportion"} < names
     assert sum("together" in name for name in names) > 4
     assert len(names) == len(compared) > 25
     assert tails(compared)["largest z"]["z"] == max((c.z for c in compared), key=abs)

@@ -71,7 +71,7 @@ WRONG = {
     "negative view": (Visibility, [0.5, -0.1, 1.0], r"state 1 is -0\.1"),
     "view of nan": (Visibility, [NAN, 0.0, 1.0], r"state 0 is nan"),
     "view of two dimensions": (Visibility, [[1.0, 0.0]], r"in_view must have shape \[S\]"),
-    "visibility": (Sensor, [2.0, 0.0, 1.0], r"presence must be .* state 0 is 2"),
+    "visibility": (Sensor, [2.0, 0.0, 1.0], r"visibility must be .* state 0 is 2"),
     "log-confusion": (ObservationModel, np.zeros((1, 2, 1, 2)), r"pair \(0, 0\) sum to 2"),
     "log-confusion of nan": (ObservationModel, np.full((1, 1, 1, 1), NAN), r"\(0, 0, 0, 0\) is nan"),
     "confusion": (ObservationModel.from_probabilities, np.ones((1, 2, 1, 2)), r"pair \(0, 0\) sum to 2"),
@@ -155,7 +155,7 @@ def test_imperfections_stand_for_what_they_have():
     sensor = Sensor(Visibility([1, 0, 1]), noise)
     np.testing.assert_array_equal(sensor.visibility, [1, 0, 1])
     assert isinstance(sensor.noise, ObservationModel)
-    with pytest.raises(TypeError, match=r"reading must be an ObservationModel or None; got 3"):
+    with pytest.raises(TypeError, match=r"noise must be an ObservationModel or None; got 3"):
         Sensor(None, 3)
     with pytest.raises(ValueError, match=r"one number of states .* got shapes \(2,\) and \(3,\)"):
         Visibility([1, 0]) * Visibility([1, 0, 1])

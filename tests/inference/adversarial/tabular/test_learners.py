@@ -289,12 +289,12 @@ def test_reports_that_cannot_be_leave_the_learner_as_it_was(mdp, learned: Learne
 @pytest.mark.parametrize(
     ("options", "says"),
     [
-        ({"iterations": 0}, "rounds must be at least 1"),
+        ({"iterations": 0}, "iterations must be at least 1"),
         ({"step": 0.0}, "step must be positive"),
         ({"entropy": 0.0}, "entropy"),
         ({"forgetting": 2.0}, "exponent"),
         ({"occupancy": "seen"}, "occupancy is one of visited, discounted"),
-        ({"average": "logits"}, "memory must be 0"),
+        ({"average": "logits"}, "forgetting must be 0"),
         ({"speed": 1}, "no option 'speed'"),
         ({"features": np.ones((2, 2))}, r"\[S, d\] = \[5, d\]"),
         ({"features": np.array([[0.0], [1], [np.nan], [2], [3]])}, "feature 0 of state s2 is nan"),
