@@ -156,7 +156,7 @@ def _weights(mdp: TabularMDP, which: str, weights: Float[np.ndarray, "D K"]) -> 
     weights = np.asarray(weights, float)
     if weights.ndim != 2 or weights.shape[1] != mdp.n_features or not len(weights):
         raise ValueError(
-            f"{which} weights must have shape [components, {mdp.n_features}], at least one, got {weights.shape}"
+            f"{which} weights must have shape [components, {mdp.n_features}], got {weights.shape}"
         )
     if not np.isfinite(weights).all():
         component, k = np.argwhere(~np.isfinite(weights))[0]
