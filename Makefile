@@ -69,7 +69,7 @@ bench-peers: $(READY) $(PEERS)/.installed
 
 $(READY): requirements.lock pyproject.toml setup.py tools/build_backend.py
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "i2rl needs Python 3.11 or later: make PYTHON=python3.11 ...")'
-	@echo "Installing requirements.lock and i2rl into $(VENV): about 1.8 GB, a minute or two."
+	@echo "Installing requirements.lock and i2rl into $(VENV): about 2 GB, a few minutes."
 	@$(PYTHON) -m venv $(VENV)
 	@$(BIN)/pip install --quiet --disable-pip-version-check -r requirements.lock
 	@$(BIN)/pip install --quiet --disable-pip-version-check --no-deps -e .
