@@ -1,3 +1,6 @@
+from .corridor.process import (
+    five_cells as five_cells,
+)
 from .gym.tabular import (
     TabularEnv as TabularEnv,
 )

@@ -35,7 +35,7 @@ class Histories(NamedTuple):
     Fields
     ------
     log_likelihood, gradient : float ``[R, T]``
-        As in :class:`~i2rl.inference.Report`.
+        As in :class:`~i2rl.inference.SessionInfo`.
     greedy : int ``[R, T, S]``
         The learned greedy policy's actions.
     error : float ``[R, T]``

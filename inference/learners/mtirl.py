@@ -85,7 +85,7 @@ class MixtureState(NamedTuple):
 
 
 class MixtureInfo(NamedTuple):
-    """What a session did; fields as in :class:`~i2rl.inference.Report`, where not said otherwise.
+    """What a session did; fields as in :class:`~i2rl.inference.SessionInfo`, where not said otherwise.
 
     Fields
     ------
@@ -174,7 +174,7 @@ def mme_mtirl(
     Returns
     -------
     Learner
-        ``update(state, demonstration)`` gives a :class:`MixtureState` and a :class:`MixtureReport`. Raises
+        ``update(state, demonstration)`` gives a :class:`MixtureState` and a :class:`MixtureInfo`. Raises
         :class:`DemonstrationError` naming trajectory and step for what the model rules out, an action that
         is not available in its state among it; the state it was given stays valid.
 

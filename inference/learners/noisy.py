@@ -104,7 +104,7 @@ class RIMEOState(NamedTuple):
 
 
 class RIMEOInfo(NamedTuple):
-    """Numbers of a session, those of :class:`~i2rl.inference.Report` and of the sensor that was learned.
+    """Numbers of a session, those of :class:`~i2rl.inference.SessionInfo` and of the sensor that was learned.
 
     Fields
     ------
@@ -192,7 +192,7 @@ def rimeo(
     Returns
     -------
     Learner
-        Its ``update`` gives a :class:`RIMEOState` and a :class:`RIMEOReport`. It raises
+        Its ``update`` gives a :class:`RIMEOState` and a :class:`RIMEOInfo`. It raises
         :class:`DemonstrationError` naming trajectory and step for a report no truth could give, and for a
         score that is missing or outside [0, 1]; the state it was given stays valid.
 
