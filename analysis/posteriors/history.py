@@ -86,7 +86,7 @@ def run_history(
     arviz.InferenceData
         ``sessions``: ``weights (session, feature)``; ``log_likelihood``, ``demonstration_log_likelihood``,
         ``gradient``, ``iterations``, ``solver_iterations`` and ``seconds (session)``, see
-        :class:`~i2rl.inference.sessions.learner.SessionInfo`. Reports with further fields give further variables.
+        :class:`~i2rl.inference.sessions.learner.SessionInfo`. Infos with further fields give more.
         ``learned``, what the learner ended with: ``soft_policy (state, action)``, ``weights (feature)`` and
         the statistic's fields (``counts (state, action)`` or ``features (feature)`` and ``start (state)``,
         and ``size``).

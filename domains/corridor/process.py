@@ -48,6 +48,7 @@ def five_cells() -> Corridor:
 
     Examples
     --------
+    >>> from i2rl.domains import five_cells
     >>> corridor = five_cells()
     >>> corridor.mdp.n_states, corridor.mdp.n_actions, corridor.mdp.feature_names
     (5, 3, ('at the end', 'moves'))
