@@ -1,4 +1,5 @@
 from .adversarial.learner import (
+    AdversarialTraining as AdversarialTraining,
     airl as airl,
 )
 from .adversarial.learner import (
