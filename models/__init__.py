@@ -2,13 +2,15 @@
 
 Importing this package switches JAX to 64-bit floats: likelihoods of long trajectories and warm-started
 programs need the digits.
+
+The laws are imported when they are first used: NumPyro takes a second to load.
 """
+
+import importlib
+from typing import TYPE_CHECKING, Any
 
 from .. import precision  # noqa: F401  (before anything computes)
 from .inputs.archives import StorageError
-from .laws.mixture import MixtureLaw, mixture_model, stick_proportions, truncation_error
-from .laws.occlusion import occlusion_model, weights_prior
-from .laws.trajectory import TrajectoryLaw, sample_demonstration
 from .observation.confusions import Confusions
 from .observation.demonstration import (
     Demonstration,
@@ -51,6 +53,18 @@ from .process.planning import (
     soft_plan,
 )
 from .process.units import feature_scale, with_scaled_features
+
+if TYPE_CHECKING:
+    from .laws.mixture import MixtureLaw, mixture_model, stick_proportions, truncation_error
+    from .laws.occlusion import occlusion_model, weights_prior
+    from .laws.trajectory import TrajectoryLaw, sample_demonstration
+
+_HOMES = {
+    "mixture": ("MixtureLaw", "mixture_model", "stick_proportions", "truncation_error"),
+    "occlusion": ("occlusion_model", "weights_prior"),
+    "trajectory": ("TrajectoryLaw", "sample_demonstration"),
+}
+_HOME_OF = {name: module for module, names in _HOMES.items() for name in names}
 
 __all__ = [
     "Confusions",
@@ -106,3 +120,13 @@ __all__ = [
     "with_scaled_features",
     "write_trajectories",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOME_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(importlib.import_module(f".laws.{_HOME_OF[name]}", __name__), name)
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})
