@@ -31,13 +31,15 @@ from ...models.observation.evidence import (
     require_possible,
 )
 from ...models.process.mdp import TabularMDP
-from ...models.process.planning import SoftPlan, require_discounted, reward_of, soft_plan
+from ...models.process.planning import SoftPlan, features_to_go, require_discounted, reward_of, soft_plan
 from ...models.process.units import feature_scale, with_scaled_features
 from ..completion.smoothing import Evidence, blocked_posterior, evidence_of, gibbs_posterior, smooth_all
 from ..programs.constraints import FeatureTarget
 from ..programs.maximum_entropy import (
+    LinearObjective,
     Solution,
     WarmStart,
+    count_objective,
     exponentiate_scaled,
     fit_scaled_counts,
     solve_scaled_dual,
@@ -45,7 +47,7 @@ from ..programs.maximum_entropy import (
 from ..sessions.scaling import on_scaled_features
 from ..sessions.schedule import Schedule, described, program_slack, require_slack, require_slack_in
 from ..sessions.session import Learner, Report
-from ..sessions.statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
+from ..sessions.statistic import STATISTICS, Completed, FeatureStatistic, Statistic, blend, complete
 
 # Nats per trajectory and unit of scaled weight. Smaller lets nearly deterministic experts be nearly so.
 DEFAULT_SLACK = 0.002
@@ -118,13 +120,15 @@ class _Method(NamedTuple):
         working = blend(kept, self.statistic.of_session(self.mdp, plan, completed))
         return working, jnp.sum(completed.expectations.log_likelihood)
 
-    def gradient(self, weights: Float[Array, " K"], values: Float[Array, " S"], working: Any) -> Array:
+    def gradient(self, plan: SoftPlan, working: Any) -> Array:
         """Norm of the log-likelihood's gradient; ``|phi_hat - E[phi]|`` with the ``features`` statistic."""
-
-        def likelihood(w: Float[Array, " K"]) -> Float[Array, ""]:
-            return self.statistic.log_likelihood(self.mdp, w, self.plan(w, values).values, working)
-
-        return jnp.linalg.norm(jax.grad(likelihood)(weights))
+        if isinstance(working, FeatureStatistic):
+            objective = LinearObjective(working.start, working.features)
+        else:
+            objective = count_objective(self.mdp, working.counts)
+        # The values' own gradient is what their policy collects.
+        expected = objective.state_weights @ features_to_go(self.mdp, plan.policy)
+        return jnp.linalg.norm(objective.features - expected)
 
     def penalties(self, statistic: Any, session: Int[Array, ""]) -> tuple:
         """Slack of the program in a session, and the prior's precision per trajectory."""
@@ -301,6 +305,15 @@ def _exponentiated(mdp: TabularMDP, statistic: Any, slack: Array, ridge: Array, 
     return exponentiate_scaled(mdp, target, slack * (1 - mdp.discount), start=start.weights)
 
 
+class _Ending(NamedTuple):
+    """The end of the EM iteration: its last point, planned for, and the demonstration completed under it."""
+
+    point: _Iterate
+    plan: SoftPlan
+    completed: Completed
+    reached: Bool[Array, ""]
+
+
 def _em(
     method: _Method,
     m_step: Callable[..., Solution],
@@ -313,33 +326,44 @@ def _em(
     key: Array,
     weights: Float[Array, " K"],
     values: Float[Array, " S"],
-) -> _Iterate:
-    """E- and M-steps of the session with this number in one compiled loop."""
+) -> _Ending:
+    """E- and M-steps of the session with this number in one compiled loop, and one more E-step."""
 
-    def step(point: _Iterate) -> _Iterate:
+    @jax.jit  # traced once, though its shapes are asked for below
+    def complete_under(point: _Iterate) -> tuple[Array, SoftPlan, Completed]:
         key, sample = jax.random.split(point.key)
         plan = method.plan(point.weights, point.values)
-        working, _ = method.working(kept, sample, plan, evidence, seen)
+        return key, plan, method.e_step(sample, plan, evidence, seen)
+
+    def improve(point: _Iterate, plan: SoftPlan, completed: Completed) -> _Iterate:
+        working = blend(kept, method.statistic.of_session(method.mdp, plan, completed))
         solution = m_step(
             method.mdp, working, *method.penalties(working, session), WarmStart(point.weights, plan.values)
         )
         gradient = lax.cond(
-            point.iterations == 0,
-            lambda: method.gradient(point.weights, plan.values, working),
-            lambda: point.gradient,
+            point.iterations == 0, lambda: method.gradient(plan, working), lambda: point.gradient
         )
         return _Iterate(
             solution.weights, solution.values, _change(point.weights, solution.weights), gradient,
-            point.iterations + 1, point.solver_iterations + solution.iterations, solution.converged, key,
+            point.iterations + 1, point.solver_iterations + solution.iterations, solution.converged,
+            point.key,
         )  # fmt: skip
 
-    def unfinished(point: _Iterate) -> Bool[Array, ""]:
-        return (point.change > tolerance) & (point.iterations < iterations)
+    # The last E-step is one more turn of the loop: it would otherwise be compiled a second time.
+    def step(now: _Ending) -> _Ending:
+        point = now.point
+        key, plan, completed = complete_under(point)
+        point = point._replace(key=key)
+        reached = ~((point.change > tolerance) & (point.iterations < iterations))
+        point = lax.cond(reached, lambda: point, lambda: improve(point, plan, completed))
+        return _Ending(point, plan, completed, reached)
 
     zero = jnp.zeros((), int)
     unsolved = jnp.array(False)
     first = _Iterate(weights, values, jnp.array(jnp.inf), jnp.array(jnp.inf), zero, zero, unsolved, key)
-    return lax.while_loop(unfinished, step, first)
+    _, *shapes = jax.eval_shape(complete_under, first)
+    unknown = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    return lax.while_loop(lambda now: ~now.reached, step, _Ending(first, *unknown, jnp.array(False)))
 
 
 def _change(old: Float[Array, " K"], new: Float[Array, " K"]) -> Float[Array, ""]:
@@ -347,18 +371,10 @@ def _change(old: Float[Array, " K"], new: Float[Array, " K"]) -> Float[Array, ""
 
 
 def _close(
-    method: _Method,
-    state: LMEState,
-    point: _Iterate,
-    program: Any,
-    evidence: Evidence,
-    seen: Bool[Array, "n L"],
+    method: _Method, state: LMEState, point: _Iterate, program: Any, plan: SoftPlan, completed: Completed
 ) -> tuple[LMEState, Report]:
-    """End a session: complete its demonstration once more, under its own result, and keep the statistic."""
+    """End a session: keep the statistic of its demonstration, completed under its own result."""
     mdp, statistic = method.mdp, method.statistic
-    key, sample = jax.random.split(point.key)
-    plan = method.plan(point.weights, point.values)
-    completed = method.e_step(sample, plan, evidence, seen)
     new = statistic.to_keep(mdp, plan, completed)
     own = jnp.sum(completed.expectations.log_likelihood)
     kept = blend(state.statistic, new)
@@ -373,7 +389,7 @@ def _close(
         "seconds": jnp.array(jnp.nan),
         "weights": point.weights,
     }
-    learned = LMEState(point.weights, kept, plan.values, program, state.session + 1, key)
+    learned = LMEState(point.weights, kept, plan.values, program, state.session + 1, point.key)
     # An observation that cannot be must not spoil what was learned (a fleet raises nothing).
     possible = jnp.isfinite(own)
     state = jax.tree.map(partial(jnp.where, possible), learned, state._replace(program=program))
@@ -412,7 +428,7 @@ def _learner(
 
         def session(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
             evidence, seen, key, weights, values = begin(state, demonstration)
-            point = _em(
+            ending = _em(
                 method,
                 in_jax[solver],
                 iterations,
@@ -425,7 +441,7 @@ def _learner(
                 weights,
                 values,
             )
-            return _close(method, state, point, state.program, evidence, seen)
+            return _close(method, state, ending.point, state.program, ending.plan, ending.completed)
 
         run = jax.jit(session)
         empty_program: Any = ()
@@ -434,7 +450,15 @@ def _learner(
 
         solve, empty_program = host_solver(mdp, solver, method.statistic.name)
         opening = jax.jit(begin)
-        closing = jax.jit(partial(_close, method))
+
+        @jax.jit
+        def closing(
+            state: LMEState, point: _Iterate, program: Any, evidence: Evidence, seen: Array
+        ) -> tuple[LMEState, Report]:
+            key, sample = jax.random.split(point.key)
+            plan = method.plan(point.weights, point.values)
+            completed = method.e_step(sample, plan, evidence, seen)
+            return _close(method, state, point._replace(key=key), program, plan, completed)
 
         @jax.jit
         def expectation(
@@ -443,7 +467,7 @@ def _learner(
             key, sample = jax.random.split(key)
             plan = method.plan(weights, values)
             working, own = method.working(state.statistic, sample, plan, evidence, seen)
-            gradient = method.gradient(weights, plan.values, working)
+            gradient = method.gradient(plan, working)
             return key, plan.values, own, gradient, working, *method.penalties(working, state.session + 1)
 
         def run(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
@@ -472,17 +496,21 @@ def _learner(
             point = _Iterate(weights, values, *counted, key)
             return closing(state, point, program, evidence, seen)
 
-    def init(key: Array) -> LMEState:
-        key, fresh = jax.random.split(as_key(key))
+    @jax.jit
+    def begun(key: Array) -> LMEState:
+        key, fresh = jax.random.split(key)
         weights = _random_weights(fresh, mdp)
         return LMEState(
             weights,
             method.statistic.empty(mdp),
             jnp.zeros(mdp.n_states),
-            empty_program,
+            (),
             jnp.zeros((), int),
             key,
         )
+
+    def init(key: Array) -> LMEState:
+        return begun(as_key(key))._replace(program=empty_program)
 
     def update(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, Report]:
         began = time.perf_counter()
@@ -574,7 +602,7 @@ def batch_lme(
 
         def from_start(key: Array) -> tuple:
             weights = _random_weights(key, mdp)
-            point = _em(
+            ending = _em(
                 method,
                 _newton,
                 iterations,
@@ -587,8 +615,7 @@ def batch_lme(
                 weights,
                 jnp.zeros(mdp.n_states),
             )
-            plan = method.plan(point.weights, point.values)
-            expectations = method.e_step(key, plan, evidence, seen).expectations
+            point, expectations = ending.point, ending.completed.expectations
             size = jnp.maximum(expectations.size, 1.0)
             average = jnp.sum(expectations.log_likelihood) / size
             penalty = slack * jnp.sum(jnp.abs(point.weights)) + ridge / size / 2 * jnp.sum(point.weights**2)
