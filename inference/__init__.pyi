@@ -1,5 +1,7 @@
 from .adversarial.learner import (
     AdversarialTraining as AdversarialTraining,
+)
+from .adversarial.learner import (
     airl as airl,
 )
 from .adversarial.learner import (

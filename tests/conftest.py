@@ -15,6 +15,7 @@ import pytest
 from hypothesis import settings
 
 from i2rl.analysis.drawing.page import GLOSSARY
+from i2rl.compilation import keep_programs
 from i2rl.models import Demonstration, TabularMDP
 from i2rl.models.observation.demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN
 from i2rl.models.observation.evidence import observe
@@ -22,6 +23,9 @@ from i2rl.models.process.planning import simulate
 
 settings.register_profile("deterministic", derandomize=True, deadline=None, max_examples=25, database=None)
 settings.load_profile("deterministic")
+
+# For this process, for other workers and for the commands that tests start.
+keep_programs()
 
 
 # Linux lets a process map 65,530 regions of memory and ends it where a compiler asks for more.

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 from typer.core import TyperGroup
 
+from ...compilation import keep_programs
 from ..drawing.results import plain
 
 if TYPE_CHECKING:
@@ -741,6 +742,7 @@ def main() -> None:
     sys.unraisablehook = _interrupt_again
     if sys.stdout is None:  # closed by whoever started this
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    keep_programs()
     app()
 
 

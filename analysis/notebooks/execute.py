@@ -25,6 +25,8 @@ from nbclient import NotebookClient
 from nbformat import NotebookNode
 from PIL import Image
 
+from ...compilation import keep_programs
+
 FOLDER = Path(__file__).parent
 _METADATA = {
     "kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"},
@@ -129,6 +131,7 @@ def _reduced(picture: str) -> str:
 
 def main(paths: Sequence[str] = ()) -> None:
     """Execute notebooks in place (all of the package's by default) and say how long each took."""
+    keep_programs()
     for path in map(Path, paths or notebooks()):
         began = time.perf_counter()
         notebook = tidy(execute_notebook(path))

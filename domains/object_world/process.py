@@ -16,7 +16,6 @@ from typing import NamedTuple
 import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
-from scipy.ndimage import label
 
 from ...models.process.mdp import TabularMDP
 
@@ -186,6 +185,8 @@ def without_blocked_moves(world: ObjectWorld) -> ObjectWorld:
 
 
 def _connected(walls: Bool[np.ndarray, "rows columns"]) -> bool:
+    from scipy.ndimage import label  # loading it takes a quarter of a second
+
     return label(~walls)[1] <= 1
 
 

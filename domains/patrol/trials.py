@@ -14,7 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
-from scipy import stats
 
 from ...models.observation.demonstration import LOST, UNKNOWN
 from ...models.observation.evidence import Visibility, observe
@@ -109,6 +108,8 @@ class BreachOutcome(NamedTuple):
 
     def interval(self, outcome: int = REACHED, level: float = 0.95) -> tuple[float, float]:
         """Wilson's confidence interval of :meth:`rate`."""
+        from scipy import stats  # loading it takes a second
+
         result = stats.binomtest(int(np.sum(self.ended == outcome)), len(self.ended))
         low, high = result.proportion_ci(level, "wilson")
         return float(low), float(high)

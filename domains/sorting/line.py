@@ -37,7 +37,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
-from scipy import stats
+from scipy.special import ndtri
 
 from .process import (
     ACTIONS,
@@ -145,7 +145,7 @@ def wilson(successes: float, trials: float, level: float = 0.95) -> Share:
     """A binomial share with Wilson's score interval; NaN without trials. Counts need not be whole."""
     if not trials:
         return Share(math.nan, math.nan, math.nan)
-    share, z = successes / trials, float(stats.norm.ppf((1 + level) / 2))
+    share, z = successes / trials, float(ndtri((1 + level) / 2))
     middle = (share + z**2 / (2 * trials)) / (1 + z**2 / trials)
     half = z / (1 + z**2 / trials) * math.sqrt(share * (1 - share) / trials + z**2 / (4 * trials**2))
     # Rounding must not put the share outside its own interval.

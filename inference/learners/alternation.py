@@ -15,12 +15,14 @@ from ...models.observation.evidence import (
     AnySensor,
 )
 from ...models.process.mdp import TabularMDP
-from ...models.process.planning import SoftPlan, reward_of, soft_plan
+from ...models.process.planning import SoftPlan, features_to_go, reward_of, soft_plan
 from ..completion.smoothing import Evidence, blocked_posterior, gibbs_posterior, smooth_all
 from ..programs.constraints import FeatureTarget
 from ..programs.maximum_entropy import (
+    LinearObjective,
     Solution,
     WarmStart,
+    count_objective,
     exponentiate_scaled,
     fit_scaled_counts,
     solve_scaled_dual,
@@ -57,13 +59,18 @@ class Method(NamedTuple):
         working = blend(kept, self.statistic.of_session(self.mdp, plan, completed))
         return working, jnp.sum(completed.expectations.log_likelihood)
 
-    def gradient(self, weights: Float[Array, " K"], values: Float[Array, " S"], working: Any) -> Array:
-        """Norm of the log-likelihood's gradient; ``|phi_hat - E[phi]|`` with the ``features`` statistic."""
+    def gradient(self, plan: SoftPlan, working: Any) -> Array:
+        """Return the norm of the log-likelihood's gradient.
 
-        def likelihood(w: Float[Array, " K"]) -> Float[Array, ""]:
-            return self.statistic.log_likelihood(self.mdp, w, self.plan(w, values).values, working)
-
-        return jnp.linalg.norm(jax.grad(likelihood)(weights))
+        With the ``features`` statistic it is ``|phi_hat - E[phi]|``.
+        """
+        if isinstance(working, FeatureStatistic):
+            objective = LinearObjective(working.start, working.features)
+        else:
+            objective = count_objective(self.mdp, working.counts)
+        # The values' own gradient is what their policy collects.
+        expected = objective.state_weights @ features_to_go(self.mdp, plan.policy)
+        return jnp.linalg.norm(objective.features - expected)
 
     def penalties(self, statistic: Any, session: Int[Array, ""]) -> tuple:
         """Slack of the program in a session, and the prior's precision per trajectory."""

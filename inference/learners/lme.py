@@ -29,7 +29,7 @@ from ...models.observation.evidence import (
     require_possible,
 )
 from ...models.process.mdp import TabularMDP
-from ...models.process.planning import require_discounted
+from ...models.process.planning import SoftPlan, require_discounted
 from ...models.process.units import feature_scale, with_scaled_features
 from ..completion.smoothing import Evidence, evidence_of
 from ..programs.maximum_entropy import (
@@ -39,7 +39,7 @@ from ..programs.maximum_entropy import (
 from ..sessions.learner import Learner, SessionInfo, digest_of
 from ..sessions.scaling import on_scaled_features
 from ..sessions.schedule import Schedule, described, require_slack_in
-from ..sessions.statistic import blend
+from ..sessions.statistic import Completed, blend
 from .alternation import (
     Method,
     checked_method,
@@ -209,6 +209,15 @@ def _started_afresh(method: Method, key: Array, state: LMEState) -> tuple:
     return random_weights(key, method.mdp), jnp.zeros_like(state.values)
 
 
+class _Ending(NamedTuple):
+    """The end of the EM iteration: its last point, planned for, and the demonstration completed under it."""
+
+    point: _Iterate
+    plan: SoftPlan
+    completed: Completed
+    reached: Bool[Array, ""]
+
+
 def _em(
     method: Method,
     m_step: Callable[..., Solution],
@@ -221,48 +230,52 @@ def _em(
     key: Array,
     weights: Float[Array, " K"],
     values: Float[Array, " S"],
-) -> _Iterate:
-    """E- and M-steps of the session with this number in one compiled loop."""
+) -> _Ending:
+    """E- and M-steps of the session with this number in one compiled loop, and one more E-step."""
 
-    def step(point: _Iterate) -> _Iterate:
+    @jax.jit  # traced once, though its shapes are asked for below
+    def complete_under(point: _Iterate) -> tuple[Array, SoftPlan, Completed]:
         key, sample = jax.random.split(point.key)
         plan = method.plan(point.weights, point.values)
-        working, _ = method.working(kept, sample, plan, evidence, seen)
+        return key, plan, method.e_step(sample, plan, evidence, seen)
+
+    def improve(point: _Iterate, plan: SoftPlan, completed: Completed) -> _Iterate:
+        working = blend(kept, method.statistic.of_session(method.mdp, plan, completed))
         solution = m_step(
             method.mdp, working, *method.penalties(working, session), WarmStart(point.weights, plan.values)
         )
         gradient = lax.cond(
-            point.iterations == 0,
-            lambda: method.gradient(point.weights, plan.values, working),
-            lambda: point.gradient,
+            point.iterations == 0, lambda: method.gradient(plan, working), lambda: point.gradient
         )
         return _Iterate(
             solution.weights, solution.values, relative_change(point.weights, solution.weights), gradient,
-            point.iterations + 1, point.solver_iterations + solution.iterations, solution.converged, key,
+            point.iterations + 1, point.solver_iterations + solution.iterations, solution.converged,
+            point.key,
         )  # fmt: skip
 
-    def unfinished(point: _Iterate) -> Bool[Array, ""]:
-        return (point.change > tolerance) & (point.iterations < iterations)
+    # The last E-step is one more turn of the loop: it would otherwise be compiled a second time.
+    def step(now: _Ending) -> _Ending:
+        point = now.point
+        key, plan, completed = complete_under(point)
+        point = point._replace(key=key)
+        reached = ~((point.change > tolerance) & (point.iterations < iterations))
+        point = lax.cond(reached, lambda: point, lambda: improve(point, plan, completed))
+        return _Ending(point, plan, completed, reached)
 
     zero = jnp.zeros((), int)
     unsolved = jnp.array(False)
     first = _Iterate(weights, values, jnp.array(jnp.inf), jnp.array(jnp.inf), zero, zero, unsolved, key)
-    return lax.while_loop(unfinished, step, first)
+    _, *shapes = jax.eval_shape(complete_under, first)
+    plan, completed = jax.tree.map(lambda x: jnp.zeros(x.shape, x.dtype), shapes)
+    beginning = _Ending(first, plan, completed, jnp.array(False))
+    return lax.while_loop(lambda now: ~now.reached, step, beginning)
 
 
 def _close(
-    method: Method,
-    state: LMEState,
-    point: _Iterate,
-    program: Any,
-    evidence: Evidence,
-    seen: Bool[Array, "n L"],
+    method: Method, state: LMEState, point: _Iterate, program: Any, plan: SoftPlan, completed: Completed
 ) -> tuple[LMEState, SessionInfo]:
-    """End a session: complete its demonstration once more, under its own result, and keep the statistic."""
+    """End a session: keep the statistic of its demonstration, completed under its own result."""
     mdp, statistic = method.mdp, method.statistic
-    key, sample = jax.random.split(point.key)
-    plan = method.plan(point.weights, point.values)
-    completed = method.e_step(sample, plan, evidence, seen)
     new = statistic.to_keep(mdp, plan, completed)
     own = jnp.sum(completed.expectations.log_likelihood)
     kept = blend(state.statistic, new)
@@ -277,7 +290,7 @@ def _close(
         "seconds": jnp.array(jnp.nan),
         "weights": point.weights,
     }
-    learned = LMEState(point.weights, kept, plan.values, program, state.session + 1, key)
+    learned = LMEState(point.weights, kept, plan.values, program, state.session + 1, point.key)
     # An observation that cannot be must not spoil what was learned (a fleet raises nothing).
     possible = jnp.isfinite(own)
     state = jax.tree.map(partial(jnp.where, possible), learned, state._replace(program=program))
@@ -316,7 +329,7 @@ def _learner(
 
         def session(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, SessionInfo]:
             evidence, seen, key, weights, values = begin(state, demonstration)
-            point = _em(
+            ending = _em(
                 method,
                 in_jax[solver],
                 iterations,
@@ -329,7 +342,7 @@ def _learner(
                 weights,
                 values,
             )
-            return _close(method, state, point, state.program, evidence, seen)
+            return _close(method, state, ending.point, state.program, ending.plan, ending.completed)
 
         run = jax.jit(session)
         empty_program: Any = ()
@@ -338,7 +351,15 @@ def _learner(
 
         solve, empty_program = host_solver(mdp, solver, method.statistic.name)
         opening = jax.jit(begin)
-        closing = jax.jit(partial(_close, method))
+
+        @jax.jit
+        def closing(
+            state: LMEState, point: _Iterate, program: Any, evidence: Evidence, seen: Array
+        ) -> tuple[LMEState, SessionInfo]:
+            key, sample = jax.random.split(point.key)
+            plan = method.plan(point.weights, point.values)
+            completed = method.e_step(sample, plan, evidence, seen)
+            return _close(method, state, point._replace(key=key), program, plan, completed)
 
         @jax.jit
         def expectation(
@@ -347,7 +368,7 @@ def _learner(
             key, sample = jax.random.split(key)
             plan = method.plan(weights, values)
             working, own = method.working(state.statistic, sample, plan, evidence, seen)
-            gradient = method.gradient(weights, plan.values, working)
+            gradient = method.gradient(plan, working)
             return key, plan.values, own, gradient, working, *method.penalties(working, state.session + 1)
 
         def run(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, SessionInfo]:
@@ -376,17 +397,21 @@ def _learner(
             point = _Iterate(weights, values, *counted, key)
             return closing(state, point, program, evidence, seen)
 
-    def init(key: Array) -> LMEState:
-        key, fresh = jax.random.split(as_key(key))
+    @jax.jit
+    def begun(key: Array) -> LMEState:
+        key, fresh = jax.random.split(key)
         weights = random_weights(fresh, mdp)
         return LMEState(
             weights,
             method.statistic.empty(mdp),
             jnp.zeros(mdp.n_states),
-            empty_program,
+            (),
             jnp.zeros((), int),
             key,
         )
+
+    def init(key: Array) -> LMEState:
+        return begun(as_key(key))._replace(program=empty_program)
 
     def update(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, SessionInfo]:
         began = time.perf_counter()
@@ -478,7 +503,7 @@ def batch_lme(
 
         def from_start(key: Array) -> tuple:
             weights = random_weights(key, mdp)
-            point = _em(
+            ending = _em(
                 method,
                 newton,
                 iterations,
@@ -491,8 +516,7 @@ def batch_lme(
                 weights,
                 jnp.zeros(mdp.n_states),
             )
-            plan = method.plan(point.weights, point.values)
-            expectations = method.e_step(key, plan, evidence, seen).expectations
+            point, expectations = ending.point, ending.completed.expectations
             size = jnp.maximum(expectations.size, 1.0)
             average = jnp.sum(expectations.log_likelihood) / size
             penalty = slack * jnp.sum(jnp.abs(point.weights)) + ridge / size / 2 * jnp.sum(point.weights**2)

@@ -418,7 +418,7 @@ class _Alternation(NamedTuple):
         working = blend(state.statistic, statistic.of_session(mdp, plan, completed), self.forgetting)
         gradient = lax.cond(
             point.iterations == 0,
-            lambda: self.method.gradient(point.weights, plan.values, working),
+            lambda: self.method.gradient(plan, working),
             lambda: point.gradient,
         )
         heard = self.perception.blend(state.reports, reports)

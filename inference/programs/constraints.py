@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
-from scipy import optimize, sparse
+from scipy import sparse
 
 from ...models.process.mdp import PairNames, TabularMDP
 from ...models.process.planning import reachable_states, require_discounted
@@ -152,6 +152,8 @@ def nearest_features(mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike = 
     Minimises ``sum_k max(|E[phi_k] - phi_hat_k| / scale_k - slack_k, 0)`` over all policies, with the
     features' scales; the constraints can be met exactly if that sum is zero.
     """
+    from scipy import optimize  # loading it takes a third of a second, and few processes come here
+
     features, start, slack = checked_problem(mdp, target, slack)
     scale = np.asarray(feature_scale(mdp))
     flow = flow_constraints(with_scaled_features(mdp), reachable_states(mdp, start))
@@ -180,6 +182,8 @@ def excluded_pairs(
     Weights are finite exactly where there are none: a soft policy takes every action. By linear programming,
     for constraints that can be met: ``sum min(x(s, a), least)`` is maximised over occupancies ``x``.
     """
+    from scipy import optimize
+
     features, start, slack = checked_problem(mdp, target, slack)
     scale = np.asarray(feature_scale(mdp))
     flow = flow_constraints(with_scaled_features(mdp), reachable_states(mdp, start))

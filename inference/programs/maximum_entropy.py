@@ -301,12 +301,13 @@ class _Iterate(NamedTuple):
     finished: Bool[Array, ""]
 
 
-class _Trial(NamedTuple):
+class _Line(NamedTuple):
+    """The line that is searched from an iterate: its direction, what it promises, and how far to go."""
+
+    move: Float[Array, " K"]
+    change: Float[Array, ""]
+    noise: Float[Array, ""]
     length: Float[Array, ""]
-    weights: Float[Array, " K"]
-    values: Float[Array, " S"]
-    objective: Float[Array, ""]
-    accepted: Bool[Array, ""]
     halvings: Int[Array, ""]
 
 
@@ -341,7 +342,7 @@ def minimise(
         finished = relative <= _TARGET_RESIDUAL
         return _Iterate(weights, values, value, at, relative, damping, iterations, finished)
 
-    def step(now: _Iterate) -> _Iterate:
+    def direction(now: _Iterate) -> _Line:
         at = now.expansion
         curvature = at.hessian + jnp.diag(ridge + now.damping * jnp.diag(at.hessian))
         slope = at.gradient + ridge * now.weights
@@ -354,40 +355,51 @@ def minimise(
         noise = 1e-14 * (1.0 + size)
         longest = jnp.max(jnp.abs(mdp.features @ move))
         first = jnp.minimum(1.0, _MAX_REWARD_CHANGE / jnp.maximum(longest, 1e-300))
+        return _Line(move, change, noise, first, jnp.array(0))
 
-        def attempt(trial: _Trial) -> _Trial:
-            length = jnp.where(trial.halvings < 0, first, 0.5 * trial.length)
-            weights = now.weights + length * move
-            values, value = evaluate(weights, now.values + length * (at.value_gradient @ move))
-            accepted = value <= now.objective + 1e-4 * length * change + noise
-            return _Trial(length, weights, values, value, accepted, trial.halvings + 1)
+    def attempt(carry: tuple[_Iterate, _Line]) -> tuple[_Iterate, _Line]:
+        now, line = carry
+        weights = now.weights + line.length * line.move
+        guess = now.values + line.length * (now.expansion.value_gradient @ line.move)
+        values, value = evaluate(weights, guess)
+        first = now.iterations < 0
+        accepted = first | (value <= now.objective + 1e-4 * line.length * line.change + line.noise)
 
-        def rejected(trial: _Trial) -> Bool[Array, ""]:
-            return ~trial.accepted & (trial.halvings < _MAX_HALVINGS)
+        def advance() -> tuple[_Iterate, _Line]:
+            damping = jnp.where(
+                line.halvings > 0,
+                jnp.clip(now.damping * 4.0, _LEAST_DAMPING, _LARGEST_DAMPING),
+                jnp.where(now.damping > _LEAST_DAMPING, now.damping / 4.0, 0.0),
+            )
+            new = arrive(weights, values, value, damping, now.iterations + 1)
+            # A predicted change lost in rounding that no longer improves the residual is the end of the road.
+            worse = ~first & ~(new.residual < now.residual)
+            stuck = ~accepted | (worse & (jnp.abs(line.change) <= line.noise))
+            kept = jax.tree.map(lambda old, fresh: jnp.where(stuck & worse, old, fresh), now, new)
+            kept = kept._replace(iterations=now.iterations + 1, finished=new.finished | stuck)
+            return kept, lax.cond(kept.finished, lambda: line, lambda: direction(kept))
 
-        none = _Trial(first, now.weights, now.values, now.objective, jnp.array(False), jnp.array(-1))
-        trial = lax.while_loop(rejected, attempt, none)
-        damping = jnp.where(
-            trial.halvings > 0,
-            jnp.clip(now.damping * 4.0, _LEAST_DAMPING, _LARGEST_DAMPING),
-            jnp.where(now.damping > _LEAST_DAMPING, now.damping / 4.0, 0.0),
-        )
-        new = arrive(trial.weights, trial.values, trial.objective, damping, now.iterations + 1)
-        # A predicted change lost in rounding that no longer improves the residual is the end of the road.
-        worse = ~(new.residual < now.residual)
-        stuck = ~trial.accepted | (worse & (jnp.abs(change) <= noise))
-        kept = jax.tree.map(lambda old, fresh: jnp.where(stuck & worse, old, fresh), now, new)
-        return kept._replace(iterations=now.iterations + 1, finished=new.finished | stuck)
+        def halve() -> tuple[_Iterate, _Line]:
+            return now, line._replace(length=0.5 * line.length, halvings=line.halvings + 1)
 
-    def unfinished(now: _Iterate) -> Bool[Array, ""]:
+        return lax.cond(accepted | (line.halvings >= _MAX_HALVINGS), advance, halve)
+
+    def unfinished(carry: tuple[_Iterate, _Line]) -> Bool[Array, ""]:
+        now, _ = carry
         return ~now.finished & (now.iterations < _MAX_ITERATIONS)
 
     if start is None:
         weights, values = jnp.zeros(mdp.n_features), jnp.zeros(mdp.n_states)
     else:
         weights, values = jnp.asarray(start.weights, float), jnp.asarray(start.values, float)
-    values, value = evaluate(weights, values)
-    final = lax.while_loop(unfinished, step, arrive(weights, values, value, jnp.zeros(()), jnp.array(0)))
+    # One loop over points to evaluate, the start the first of them, so that planning and expanding are in the
+    # compiled program once: compiling it is what a first session waits for.
+    zero, nowhere = jnp.zeros(()), jnp.array(jnp.inf)
+    n = len(weights)
+    unknown = _Expansion(jnp.zeros(n), jnp.zeros((n, n)), jnp.zeros((len(values), n)), zero)
+    before = _Iterate(weights, values, nowhere, unknown, nowhere, zero, jnp.array(-1), jnp.array(False))
+    still = _Line(jnp.zeros(n), zero, zero, zero, jnp.array(0))
+    final, _ = lax.while_loop(unfinished, attempt, (before, still))
     return Solution(
         final.weights,
         final.values,

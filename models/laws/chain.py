@@ -141,16 +141,16 @@ def _exactly(
     # Nothing but its arguments is kept for a derivative of what is hardly ever computed.
     again = jax.checkpoint(every(in_logs))
 
-    def plain() -> Passed:
-        return jax.vmap(complete, (None, 0, 0, 0))(mdp, factors, live, forward)
+    # Outside the branches, so that it is compiled once.
+    plain = jax.vmap(complete, (None, 0, 0, 0))(mdp, factors, live, forward)
 
     def repaired() -> Passed:
         def chosen(x: Array, y: Array) -> Array:
             return jnp.where(forward.lost.reshape(-1, *[1] * (x.ndim - 1)), x, y)
 
-        return jax.tree.map(chosen, again(mdp, factors, live), plain())
+        return jax.tree.map(chosen, again(mdp, factors, live), plain)
 
-    return lax.cond(jnp.any(forward.lost), repaired, plain)
+    return lax.cond(jnp.any(forward.lost), repaired, lambda: plain)
 
 
 # -- in plain numbers -----------------------------------------------------------------------------------

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import numpyro.distributions as dist
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 from numpyro.distributions import constraints
 from numpyro.distributions.util import validate_sample
 
@@ -77,15 +78,16 @@ class TrajectoryLaw(dist.Distribution):
     def __init__(
         self,
         mdp: TabularMDP,
-        weights: Float[Array, " K"],
+        weights: ArrayLike,
         sensor: AnySensor,
         length: int,
         *,
         validate_args: bool | None = None,
     ) -> None:
         sensor = fitting_sensor(sensor, mdp)
-        self.mdp, self.weights, self.sensor, self.length = mdp, weights, sensor, length
-        self.log_policy = soft_plan(mdp, reward_of(mdp, weights)).log_policy
+        self.mdp, self.sensor, self.length = mdp, sensor, length
+        self.weights = jnp.asarray(weights)
+        self.log_policy = soft_plan(mdp, reward_of(mdp, self.weights)).log_policy
         super().__init__((), (length, 3), validate_args=validate_args)
 
     @property

@@ -6,13 +6,15 @@ policy are differentiable in the reward, the transition probabilities and the di
 horizon by the implicit function theorem: no unrolling.
 
 A reward or a policy that is not a number is refused with its state and action where there are numbers to look
-at, and makes every result NaN where JAX traces it.
+at, and makes every result NaN where JAX traces it. Each function checks its arguments and then calls a
+compiled one, so that a call outside ``jit`` compiles for a new shape only.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial, wraps
 from typing import Any, NamedTuple
 
 import jax
@@ -32,6 +34,25 @@ _MAX_STEPS = 20_000
 # Work of one accelerated step: this many backups, or Krylov iterations that must gain more than they would.
 _BACKUPS = 50
 _EPS = float(jnp.finfo(jnp.float64).eps)
+
+
+def _compiled(*static: str) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """Compile a function once for each shape, and for each value of its ``static`` arguments."""
+
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        # The limit decides which program is traced.
+        @partial(jax.jit, static_argnames=("limit", *static))
+        def compiled(*arguments: Any, limit: int, **options: Any) -> Any:
+            del limit
+            return function(*arguments, **options)
+
+        @wraps(function)
+        def called(*arguments: Any, **options: Any) -> Any:
+            return compiled(*arguments, limit=DIRECT_LIMIT, **options)
+
+        return called
+
+    return decorate
 
 
 class SoftPlan(NamedTuple):
@@ -110,8 +131,13 @@ def soft_plan(
     """
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
+    return _soft_plan(mdp, reward, start)
+
+
+@_compiled()
+def _soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], start: Float[Array, " S"] | None) -> SoftPlan:
     start = jnp.zeros(mdp.n_states) if start is None else jnp.asarray(start, float)
-    values = _soft_values(mdp, jnp.asarray(reward), lax.stop_gradient(start))
+    values = _soft_values(mdp, reward, lax.stop_gradient(start))
     q = action_values(mdp, reward, values)
     v = jax.nn.logsumexp(q, axis=1)
     return SoftPlan(v, q, q - v[:, None])
@@ -152,7 +178,11 @@ def hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: float = 1
     """
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
+    return _hard_plan(mdp, reward, tolerance)
 
+
+@_compiled()
+def _hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: Float[Array, ""]) -> HardPlan:
     def backup(values: Float[Array, " S"]) -> Float[Array, " S"]:
         return jnp.max(action_values(mdp, reward, values), axis=1)
 
@@ -168,7 +198,7 @@ def hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: float = 1
     return HardPlan(values, q, greedy_actions(q, tolerance))
 
 
-def greedy_actions(q: Float[Array, "S A"], tolerance: float = 1e-9) -> Bool[Array, "S A"]:
+def greedy_actions(q: Float[Array, "S A"], tolerance: float | Array = 1e-9) -> Bool[Array, "S A"]:
     """Every action whose value is within ``tolerance`` (relative to the values' spread) of the best."""
     best = jnp.max(q, axis=1, keepdims=True)
     finite = jnp.where(jnp.isfinite(q), q, best)
@@ -280,6 +310,13 @@ def solve_values(
     Raises ``ValueError`` for discount 1.
     """
     require_discounted(mdp)
+    return _solve_values(mdp, policy, rate)
+
+
+@_compiled()
+def _solve_values(
+    mdp: TabularMDP, policy: Float[Array, "S A"], rate: Float[Array, " S ..."]
+) -> Float[Array, " S ..."]:
     fixed, fixed_policy = lax.stop_gradient((mdp, policy))
 
     def expected(mdp: TabularMDP, policy: Float[Array, "S A"], x: Float[Array, " S"]) -> Float[Array, " S"]:
@@ -379,23 +416,44 @@ def policy_values(
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
     _require_numbers(mdp, "policy", policy)
-    return solve_values(mdp, policy, jnp.sum(policy * jnp.where(mdp.available, reward, 0.0), axis=1))
+    return _policy_values(mdp, policy, reward)
+
+
+@_compiled()
+def _policy_values(
+    mdp: TabularMDP, policy: Float[Array, "S A"], reward: Float[Array, "S A"]
+) -> Float[Array, " S"]:
+    return _solve_values(mdp, policy, jnp.sum(policy * jnp.where(mdp.available, reward, 0.0), axis=1))
 
 
 def features_to_go(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array, "S K"]:
     """``mu(s)``: expected discounted features collected from each state on."""
+    require_discounted(mdp)
     _require_numbers(mdp, "policy", policy)
-    return solve_values(mdp, policy, jnp.einsum("sa,sak->sk", policy, mdp.features))
+    return _features_to_go(mdp, policy)
+
+
+@_compiled()
+def _features_to_go(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array, "S K"]:
+    return _solve_values(mdp, policy, jnp.einsum("sa,sak->sk", policy, mdp.features))
 
 
 def occupancy(
     mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, "S A"]:
     """Discounted occupancy ``x(s, a) = sum_t gamma^t P(s_t = s, a_t = a)``; sums to ``1 / (1 - gamma)``."""
+    require_discounted(mdp)
     _require_numbers(mdp, "policy", policy)
-    initial = mdp.initial if initial is None else initial
+    return _occupancy(mdp, policy, initial)
+
+
+@_compiled()
+def _occupancy(
+    mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None
+) -> Float[Array, "S A"]:
+    initial = mdp.initial if initial is None else jnp.asarray(initial, float)
     # The transpose of the linear map above; differentiating it gives the transposed solve.
-    _, pull = jax.vjp(lambda rate: solve_values(mdp, policy, rate), jnp.zeros(mdp.n_states))
+    _, pull = jax.vjp(lambda rate: _solve_values(mdp, policy, rate), jnp.zeros(mdp.n_states))
     return pull(initial)[0][:, None] * policy
 
 
@@ -403,7 +461,16 @@ def feature_expectations(
     mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, " K"]:
     """Expected discounted features ``E_X[phi_k]`` of a policy."""
-    return jnp.einsum("sa,sak->k", occupancy(mdp, policy, initial), mdp.features)
+    require_discounted(mdp)
+    _require_numbers(mdp, "policy", policy)
+    return _feature_expectations(mdp, policy, initial)
+
+
+@_compiled()
+def _feature_expectations(
+    mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None
+) -> Float[Array, " K"]:
+    return jnp.einsum("sa,sak->k", _occupancy(mdp, policy, initial), mdp.features)
 
 
 def feature_deviations(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array, " K"]:
@@ -412,11 +479,18 @@ def feature_deviations(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Ar
     Exact: the second moment of a discounted sum obeys a Bellman equation with discount ``gamma^2`` and rate
     ``phi^2 + 2 gamma phi E[mu(s')]`` (Sobel 1982). Raises ``ValueError`` for discount 1.
     """
-    to_go = features_to_go(mdp, policy)
+    require_discounted(mdp)
+    _require_numbers(mdp, "policy", policy)
+    return _feature_deviations(mdp, policy)
+
+
+@_compiled()
+def _feature_deviations(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array, " K"]:
+    to_go = _features_to_go(mdp, policy)
     onward = jax.vmap(mdp.expect_next, in_axes=1, out_axes=2)(to_go)
     rate = jnp.einsum("sa,sak->sk", policy, mdp.features * (mdp.features + 2 * mdp.discount * onward))
     squared = replace(mdp, discount=mdp.discount**2)
-    second = mdp.initial @ solve_values(squared, policy, rate)
+    second = mdp.initial @ _solve_values(squared, policy, rate)
     return jnp.sqrt(jnp.maximum(second - (mdp.initial @ to_go) ** 2, 0.0))
 
 
@@ -433,7 +507,11 @@ class FinitePlan(NamedTuple):
 def finite_soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int) -> FinitePlan:
     """Soft plan over ``horizon`` steps by one backward sweep; any discount in (0, 1]."""
     _require_numbers(mdp, "reward", reward)
+    return _finite_soft_plan(mdp, reward, horizon=horizon)
 
+
+@_compiled("horizon")
+def _finite_soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], *, horizon: int) -> FinitePlan:
     def back(values: Float[Array, " S"], _: None) -> tuple:
         q = action_values(mdp, reward, values)
         v = jax.nn.logsumexp(q, axis=1)
@@ -446,7 +524,11 @@ def finite_soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int)
 def finite_hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int) -> FinitePlan:
     """Optimal plan over ``horizon`` steps; ties are shared evenly; any discount in (0, 1]."""
     _require_numbers(mdp, "reward", reward)
+    return _finite_hard_plan(mdp, reward, horizon=horizon)
 
+
+@_compiled("horizon")
+def _finite_hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], *, horizon: int) -> FinitePlan:
     def back(values: Float[Array, " S"], _: None) -> tuple:
         q = action_values(mdp, reward, values)
         best = greedy_actions(q)
@@ -461,12 +543,18 @@ def finite_occupancy(
 ) -> Float[Array, "T S A"]:
     """Undiscounted visit probabilities ``P(s_t = s, a_t = a)`` of a time-dependent policy."""
     _require_numbers(mdp, "policy", policies)
+    return _finite_occupancy(mdp, policies, initial)
 
+
+@_compiled()
+def _finite_occupancy(
+    mdp: TabularMDP, policies: Float[Array, "T S A"], initial: Float[Array, " S"] | None
+) -> Float[Array, "T S A"]:
     def step(state: Float[Array, " S"], policy: Float[Array, "S A"]) -> tuple:
         pairs = state[:, None] * policy
         return mdp.push_forward(pairs), pairs
 
-    return lax.scan(step, mdp.initial if initial is None else initial, policies)[1]
+    return lax.scan(step, mdp.initial if initial is None else jnp.asarray(initial, float), policies)[1]
 
 
 # -- reachability -------------------------------------------------------------------------------------
@@ -494,7 +582,14 @@ def simulate(
 ) -> tuple[Int[Array, " T"], Int[Array, " T"]]:
     """Draw one trajectory of ``length`` pairs (states, actions) under a policy, from ``first`` or ``p0``."""
     _require_numbers(mdp, "log-policy", log_policy)
-    start_key, key = jax.random.split(as_key(key))
+    return _simulate(as_key(key), mdp, log_policy, first, length=length)
+
+
+@_compiled("length")
+def _simulate(
+    key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], first: Int[Array, ""] | None, *, length: int
+) -> tuple[Int[Array, " T"], Int[Array, " T"]]:
+    start_key, key = jax.random.split(key)
     state = jax.random.categorical(start_key, jnp.log(mdp.initial)) if first is None else jnp.asarray(first)
 
     def step(state: Int[Array, ""], key: Array) -> tuple:
