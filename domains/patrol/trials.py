@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from scipy import stats
 
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import LOST, UNKNOWN
 from ...models.observation.evidence import Visibility, observe
 from ...models.process.mdp import TabularMDP
@@ -85,6 +86,7 @@ GoRule = GoAtBestTime | GoWhenBest | GoAtRandom
 # -- trials -------------------------------------------------------------------------------------------
 
 
+@shown_briefly
 class BreachOutcome(NamedTuple):
     """How ``n`` runs ended.
 

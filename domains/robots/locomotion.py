@@ -27,6 +27,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ...models.inputs.display import shown_briefly
 from ...models.inputs.extras import required
 from ...models.networks.modules import ActionSpace
 
@@ -73,6 +74,7 @@ class Capsule(NamedTuple):
     radius: float
 
 
+@shown_briefly
 class Locomotion(NamedTuple):
     """One robot's task; made by :func:`locomotion`.
 

@@ -27,6 +27,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.inputs.extras import required
 from ...models.networks.environment import Environment, HostEnvironment, Rollout
 from ...models.networks.modules import DTYPE, MLP, ActionSpace, Policy, ShapedReward
@@ -104,6 +105,7 @@ def _replace(replaced: Any, random: Any, intended: Any) -> Any:
 # -- acting with noise ------------------------------------------------------------------------------------
 
 
+@shown_briefly
 class NoisyRollout(NamedTuple):
     """What an agent did while some of its actions were replaced.
 

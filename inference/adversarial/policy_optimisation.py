@@ -28,6 +28,7 @@ from jax import lax
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.inputs.extras import required
 from ...models.networks.environment import Environment, Rollout
 from ...models.networks.modules import DTYPE, MLP, CategoricalPolicy, GaussianPolicy, Policy, RunningNorm
@@ -84,6 +85,7 @@ class Settings(NamedTuple):
         return self.n_envs * self.n_steps
 
 
+@shown_briefly
 class ReturnScale(NamedTuple):
     """The spread of discounted returns so far.
 
@@ -97,6 +99,7 @@ class ReturnScale(NamedTuple):
     norm: RunningNorm
 
 
+@shown_briefly
 class PPOState(NamedTuple):
     """An agent in the middle of its episodes: all that is needed to go on.
 
@@ -120,6 +123,7 @@ class PPOState(NamedTuple):
     key: Array
 
 
+@shown_briefly
 class Training(NamedTuple):
     """How training went, one entry for each rollout.
 
@@ -135,6 +139,7 @@ class Training(NamedTuple):
     episodes: Int[np.ndarray, " U"]
 
 
+@shown_briefly
 class PPO(NamedTuple):
     """An agent: its task, its settings, and its functions; made by :func:`ppo`.
 
@@ -204,6 +209,7 @@ def advantages(
     return lax.scan(back, jnp.zeros_like(surprises[0]), (surprises, onwards), reverse=True)[1]
 
 
+@shown_briefly
 class Sample(NamedTuple):
     """What a gradient is taken of: steps of a rollout with their estimates, ``[m, ...]``."""
 

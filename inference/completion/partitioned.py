@@ -25,6 +25,7 @@ from jax import lax
 from jaxtyping import Array, ArrayLike, Float
 from scipy import ndimage, sparse
 
+from ...models.inputs.display import shown_briefly
 from ...models.laws.chain import Filtered, filter_all, sample_backward, smooth_all
 from ...models.observation.recordings import FiniteSensor, Recording, ShiftSensor, Truths, truths
 from ...models.process.mdp import TabularMDP
@@ -33,6 +34,7 @@ DynamicsOfActions = Callable[[Array, Array], Array]
 """Next states ``[..., d]`` after states ``[..., d]`` and numbered actions ``[...]``, in JAX."""
 
 
+@shown_briefly
 class CandidatePosterior(NamedTuple):
     """Which of a report's truths it was.
 
@@ -92,6 +94,7 @@ def _draw_candidates(key: Array, chain: _Moves, alpha: Float[Array, "L K"]) -> A
     return jnp.concatenate([rest, last[None]])
 
 
+@shown_briefly
 class Box(NamedTuple):
     """Where states can be, ``[d]`` each."""
 
@@ -149,6 +152,7 @@ def _candidate_draws(key: Array, chains: _Moves, places: Array, draws: int) -> F
     return jax.vmap(one, out_axes=1)(jax.random.split(key, len(places)), chains, places)
 
 
+@shown_briefly
 class CandidateTruth(NamedTuple):
     """``init(recording, sensor) -> chain``, ``refresh(chain, policy, key, sensor) -> (chain, truths)``.
 
@@ -216,6 +220,7 @@ def fitted_shift_sensor(
     return sensor._replace(probability=jnp.clip(share, 1e-6, 1 - 1e-6))
 
 
+@shown_briefly
 class Partition(NamedTuple):
     """A space cut into cells.
 
@@ -305,6 +310,7 @@ def _grid(marks: Array, d: int) -> Float[Array, "N d"]:
     return jnp.stack(jnp.meshgrid(*[marks] * d, indexing="ij"), -1).reshape(-1, d).astype(float)
 
 
+@shown_briefly
 class PartitionTruth(NamedTuple):
     """The dissertation's Technique 1: as :class:`CandidateTruth`, by way of cells."""
 

@@ -34,6 +34,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
 from ...models.observation.evidence import Sensor, checked_demonstration, require_possible
 from ...models.process.mdp import Labels, TabularMDP
@@ -44,6 +45,7 @@ from ..sessions.session import Learner, Report
 from ..sessions.statistic import FEATURES, FeatureStatistic, complete
 
 
+@shown_briefly
 class DarkoState(NamedTuple):
     """What DARKO carries on.
 
@@ -57,6 +59,7 @@ class DarkoState(NamedTuple):
     session: Int[Array, ""]
 
 
+@shown_briefly
 class Margin(NamedTuple):
     """A session under some weights: ``margin [K]``, ``E[phi | pi] - phi_hat``, and what it was made of.
 

@@ -23,6 +23,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import SEEN, Demonstration, DemonstrationError
 from ...models.observation.evidence import (
     FeatureNoise,
@@ -71,6 +72,7 @@ DEFAULT_MEMORY = 0.8
 DEFAULT_START = 0.75
 
 
+@shown_briefly
 class RIMEOState(NamedTuple):
     """What RIMEO carries from session to session: ``(|Xi|, P*, phi_hat)`` and the reward.
 
@@ -102,6 +104,7 @@ class RIMEOState(NamedTuple):
     key: Array
 
 
+@shown_briefly
 class RIMEOReport(NamedTuple):
     """Numbers of a session, those of :class:`~i2rl.inference.Report` and of the sensor that was learned.
 

@@ -21,6 +21,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import brief, brief_table, counted, joined, shown_briefly
 from ...models.inputs.text import shortened
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 AnyReport = TypeVar("AnyReport", bound=tuple)
 
 
+@shown_briefly
 class Report(NamedTuple):
     """What a session did: plain numbers (from a fleet, arrays with one entry a stream).
 
@@ -101,6 +103,19 @@ class Learner(NamedTuple):
     session: Callable[[Any, Demonstration], tuple[Any, Report]] | None = None
     log_likelihood: Callable[[Any, Float[Array, " K"]], float] | None = None
 
+    def __repr__(self) -> str:
+        return joined(type(self).__name__, [
+            brief(self.name), repr(self.mdp), *(f"{name}={value}" for name, value in self._settings()),
+        ])  # fmt: skip
+
+    def _repr_html_(self) -> str:
+        rows = [("mdp", repr(self.mdp)), *self._settings()]
+        return brief_table(f"{type(self).__name__} {brief(self.name)}", rows)
+
+    def _settings(self) -> list[tuple[str, str]]:
+        known = self.configuration if isinstance(self.configuration, Mapping) else {}
+        return [(brief(str(name)).strip("'"), brief(value)) for name, value in known.items()]
+
     @property
     def signature(self) -> str:
         """Digest of the MDP, the method and its configuration: what a journal must have been made for."""
@@ -110,6 +125,7 @@ class Learner(NamedTuple):
         return hashlib.sha256(content.encode()).hexdigest()
 
 
+@shown_briefly
 class Fleet(NamedTuple):
     """One learner on many independent streams: states and demonstrations with a leading axis."""
 
@@ -299,6 +315,24 @@ class Run(NamedTuple):
     reports: tuple[Report, ...]
     stopped: bool
 
+    def __repr__(self) -> str:
+        (_, sessions), (_, ended), *last, (_, state) = self._rows()
+        told = [counted(int(sessions), "session"), ended, *(f"{name} {value}" for name, value in last), state]
+        return joined(type(self).__name__, told)
+
+    def _repr_html_(self) -> str:
+        return brief_table(type(self).__name__, self._rows())
+
+    def _rows(self) -> list[tuple[str, str]]:
+        reports = self.reports if isinstance(self.reports, tuple) else ()
+        last = [
+            (f"last {name.replace('_', ' ')}", brief(getattr(reports[-1], name)))
+            for name in ("log_likelihood", "weights")
+            if reports and hasattr(reports[-1], name)
+        ]
+        ended = "stopped by the criterion" if self.stopped is True else "the stream ended"
+        return [("sessions", str(len(reports))), ("end", ended), *last, ("state", brief(self.state))]
+
 
 def run_sessions(
     learner: Learner,
@@ -371,7 +405,7 @@ def run_sessions(
 
 
 def _require_stream(stream: Any) -> None:
-    if isinstance(stream, tuple) and hasattr(stream, "_fields"):
+    if isinstance(stream, Demonstration) or (isinstance(stream, tuple) and hasattr(stream, "_fields")):
         name = type(stream).__name__
         several = f", {name}.sessions() for one a trajectory" if hasattr(stream, "sessions") else ""
         advice = f"pass [it] for one session{several}"

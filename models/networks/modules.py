@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float, Int
 
+from ..inputs.display import shown_briefly
 from ..inputs.extras import required
 
 if TYPE_CHECKING:
@@ -24,6 +25,7 @@ else:
 DTYPE = jnp.float32
 
 
+@shown_briefly
 class ActionSpace(NamedTuple):
     """Actions of a task: ``n`` of them, or vectors between ``low [k]`` and ``high [k]`` (then ``n`` is 0)."""
 

@@ -22,6 +22,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ..inputs.arguments import as_key, is_traced
+from ..inputs.display import shown_briefly
 from .mdp import TabularMDP, _PairNames
 
 # Up to here a dense [S, S] factorisation beats Krylov iterations (0.1 ms at 124 states, 12 ms at 1024).
@@ -34,6 +35,7 @@ _BACKUPS = 50
 _EPS = float(jnp.finfo(jnp.float64).eps)
 
 
+@shown_briefly
 class SoftPlan(NamedTuple):
     """Solution of the soft Bellman equations.
 
@@ -51,6 +53,7 @@ class SoftPlan(NamedTuple):
         return jnp.exp(self.log_policy)
 
 
+@shown_briefly
 class HardPlan(NamedTuple):
     """Solution of the Bellman optimality equations, with every optimal action kept."""
 
@@ -423,6 +426,7 @@ def feature_deviations(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Ar
 # -- finite horizon -----------------------------------------------------------------------------------
 
 
+@shown_briefly
 class FinitePlan(NamedTuple):
     """Plan over ``T`` steps: ``values[t, s]`` of the steps from ``t`` on, and the policy of each step."""
 
