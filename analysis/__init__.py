@@ -66,7 +66,7 @@ _HOMES = {
     "posteriors.information": ("complete_information", "expected_information", "observed_information"),
     "posteriors.invariance": ("Direction", "unidentified_directions"),
     "studies.label_bias.study": ("Correlation", "LabelBiasStudy", "correlation"),
-    "drawing.maps": ("hidden_path", "policy_map"),
+    "drawing.maps": ("hidden_path", "policy_map", "value_map"),
     "judging.metrics": (
         "Accuracy",
         "Evaluation",

@@ -30,6 +30,7 @@ from .observation.evidence import (
 )
 from .observation.recordings import GaussianSensor, Recording, RecordingError, ShiftSensor, distort, recording
 from .observation.storage import load_mdp, save_mdp
+from .process.layout import Layout, Mark
 from .process.mdp import TabularMDP
 from .process.planning import (
     FinitePlan,
@@ -61,7 +62,9 @@ __all__ = [
     "GaussianSensor",
     "HardPlan",
     "Imperfection",
+    "Layout",
     "LineLimits",
+    "Mark",
     "MixtureLaw",
     "ObservationModel",
     "Record",
