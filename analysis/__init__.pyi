@@ -37,6 +37,9 @@ from .drawing.maps import (
 from .drawing.maps import (
     policy_map as policy_map,
 )
+from .drawing.maps import (
+    value_map as value_map,
+)
 from .judging.metrics import (
     demonstration_log_likelihoods as demonstration_log_likelihoods,
 )

@@ -88,6 +88,9 @@ from .observation.storage import (
 from .observation.storage import (
     save_mdp as save_mdp,
 )
+from .process.layout import (
+    Layout as Layout,
+)
 from .process.mdp import (
     TabularMDP as TabularMDP,
 )

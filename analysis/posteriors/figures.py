@@ -22,8 +22,9 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
-from ...domains.patrol.process import Patrol
 from ...models.observation.demonstration import PAD, SEEN
+from ...models.process.layout import Layout, require_layout
+from ...models.process.mdp import TabularMDP
 from ..drawing.maps import hidden_path
 from ..drawing.style import LIGHT, SMALL, TEXT, Theme, dress, foot, head, name_ticks, new_figure, series_style
 from ..drawing.text import counted, for_figure, number
@@ -285,31 +286,34 @@ def convergence_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: st
 
 
 def completed_path(
-    patrol: Patrol,
+    mdp: TabularMDP,
     idata: az.InferenceData,
     trajectories: Sequence[int],
+    layout: Layout,
     path: Int[np.ndarray, " L"] | None = None,
     *,
+    seconds: float | None = None,
     theme: Theme = LIGHT,
-    title: str = "Where the patroller may have been",
+    title: str = "Where the agent may have been",
 ) -> Figure:
-    """Completions of a partly hidden path on the map's corridors: how often each cell in the posterior.
+    """Draw completions of a partly hidden path: how often each place in the posterior.
 
     The uncertainty about the weights is in it, since each draw of the weights has its own completion.
     ``trajectories`` are the rows to show, one after the other (consecutive windows of one patrol, say);
     ``path`` is the true states of their steps. See :func:`~i2rl.analysis.drawing.maps.hidden_path`.
 
-    Raises ``ValueError`` for rows that do not exist.
+    Raises ``ValueError`` for rows that do not exist and a layout of another number of states.
     """
-    belief, seen = completion_frequencies(idata, trajectories, patrol)
-    return hidden_path(patrol, belief, seen, path, theme=theme, title=title)
+    require_layout(layout, mdp)
+    belief, seen = completion_frequencies(idata, trajectories, mdp)
+    return hidden_path(belief, seen, layout, path, seconds=seconds, theme=theme, title=title)
 
 
 def completion_frequencies(
-    idata: az.InferenceData, trajectories: Sequence[int], patrol: Patrol
+    idata: az.InferenceData, trajectories: Sequence[int], mdp: TabularMDP
 ) -> tuple[Float[np.ndarray, "L S"], np.ndarray]:
     """How often each state completes each step, and whether the step was seen; rows joined one by one."""
-    require_posterior(idata, patrol.mdp)
+    require_posterior(idata, mdp)
     for group, made in (("completions", "sample_posterior(..., completions=True)"),
                         ("observed_data", "sample_posterior")):  # fmt: skip
         if group not in idata.groups():
@@ -321,7 +325,7 @@ def completion_frequencies(
     kinds = idata["observed_data"]["kind"].values[rows].ravel()
     states = idata["completions"]["state"].values[..., rows, :]
     states = states.reshape(-1, len(kinds))[:, kinds != PAD]
-    hits = [np.bincount(column, minlength=patrol.mdp.n_states) for column in states.T]
+    hits = [np.bincount(column, minlength=mdp.n_states) for column in states.T]
     return np.array(hits) / len(states), kinds[kinds != PAD] == SEEN
 
 

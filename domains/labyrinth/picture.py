@@ -13,30 +13,12 @@ from ..gym.canvas import (
     Scene,
     new_canvas,
 )
-from .process import HOME, LEVELS, N_NODES, WATER_PORT, Labyrinth, parent_of
-
-
-def maze_layout() -> np.ndarray:
-    """Where nodes and home lie, ``[N_NODES + 1, 2]`` as (x, y): a tree of Hs, left and right as walked."""
-    places = np.zeros((N_NODES + 1, 2))
-    places[HOME] = 0.0, -16.0
-    for node in range(1, N_NODES):
-        level = int(np.log2(node + 1))
-        ahead = _ahead(places, parent_of(node))
-        side = np.array([-ahead[1], ahead[0]]) * (1 if node % 2 else -1)
-        places[node] = places[parent_of(node)] + side * 2.0 ** (LEVELS // 2 - (level - 1) // 2)
-    return places
-
-
-def _ahead(places: np.ndarray, node: int) -> np.ndarray:
-    """Direction in which a node is entered from above."""
-    way = places[node] - places[parent_of(node)]
-    return way / np.abs(way).sum()
+from .process import HOME, N_NODES, WATER_PORT, Labyrinth, maze_positions, parent_of
 
 
 def labyrinth_scene(labyrinth: Labyrinth) -> Scene:
     """The maze with its water port and the mouse, nose where it is going."""
-    places = maze_layout()
+    places = maze_positions()
     axes = new_canvas(-15.5, 15.5, -17.5, 15.5, 16, caption=3)
     axes.add_patch(Rectangle((-15.5, -17.5), 31, 33, facecolor=WALL, zorder=0))
     for node in range(N_NODES):

@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.inputs.text import shortened
 from ...models.observation.demonstration import (
     DEFAULT_LIMITS,
@@ -38,6 +39,7 @@ from ...models.observation.demonstration import (
     require_few,
 )
 from ...models.observation.evidence import Visibility
+from ...models.process.layout import Layout, Mark
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import reward_of, simulate, soft_plan
 
@@ -77,6 +79,7 @@ def destination(node: int, action: int) -> int | None:
     return None if node >= FIRST_END else 2 * node + action
 
 
+@shown_briefly
 class Labyrinth(NamedTuple):
     """The labyrinth as a decision process.
 
@@ -101,6 +104,18 @@ class Labyrinth(NamedTuple):
         """States with more than one available action."""
         return np.asarray(self.mdp.available).sum(1) > 1
 
+    @property
+    def layout(self) -> Layout:
+        """The maze for pictures, a tree of Hs: the states of a node together, corridors between nodes."""
+        marks = (
+            Mark("H", (0.0, -16.0), "home"),
+            Mark("W", tuple(maze_positions()[WATER_PORT].tolist()), "the water port"),
+        )
+        named = Layout.points(maze_positions()[self.node], self.mdp, marks=marks)
+        nodes = {int(p): int(n) for p, n in zip(named.place, self.node, strict=True)}
+        names = tuple("home" if nodes[p] == HOME else str(nodes[p]) for p in range(named.n_places))
+        return named._replace(names=names)
+
     def below(self, node: int) -> Bool[np.ndarray, " S"]:
         """States in the part of the maze that begins at ``node``."""
         inside = np.zeros(N_NODES + 1, bool)
@@ -111,6 +126,19 @@ class Labyrinth(NamedTuple):
     def without_left_half(self) -> Visibility:
         """A view of everything but the left half of the maze, from node 1 on."""
         return Visibility(~self.below(1))
+
+
+def maze_positions() -> Float[np.ndarray, "127+1 2"]:
+    """Place nodes and home at (x, y): a tree of Hs, left and right as walked."""
+    places = np.zeros((N_NODES + 1, 2))
+    places[HOME] = 0.0, -16.0
+    for node in range(1, N_NODES):
+        level = int(np.log2(node + 1))
+        way = places[parent_of(node)] - places[parent_of(parent_of(node))]
+        ahead = way / np.abs(way).sum()
+        side = np.array([-ahead[1], ahead[0]]) * (1 if node % 2 else -1)
+        places[node] = places[parent_of(node)] + side * 2.0 ** (LEVELS // 2 - (level - 1) // 2)
+    return places
 
 
 @cache
@@ -195,6 +223,7 @@ def _features(node: int, entry: int, action: int, target: int) -> Float[np.ndarr
 # -- recordings ---------------------------------------------------------------------------------------
 
 
+@shown_briefly
 class Bout(NamedTuple):
     """One visit to the maze.
 

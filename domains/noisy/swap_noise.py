@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ...models.inputs.arguments import concrete, is_traced, rebuilt_unchecked
+from ...models.inputs.display import shown_briefly
 from ...models.observation.evidence import AnySensor, ObservationModel, Sensor
 
 
@@ -17,6 +18,7 @@ class _SwapFields(NamedTuple):
     chances: Float[Array, " M"]
 
 
+@shown_briefly
 @rebuilt_unchecked
 class SwapNoise(_SwapFields):
     """Confusions that happen independently of each other: the report is the truth with some swaps applied.

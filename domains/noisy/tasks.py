@@ -28,6 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import SEEN, Demonstration
 from ...models.observation.evidence import (
     AnySensor,
@@ -110,6 +111,7 @@ def _stacked(*predicates: Bool[np.ndarray, "..."]) -> Bool[np.ndarray, "J S A"]:
 # -- the two tasks ------------------------------------------------------------------------------------
 
 
+@shown_briefly
 class NoisyTask(NamedTuple):
     """A task, its expert, and how its pairs are confused.
 
@@ -297,6 +299,7 @@ def _reading(noise: AnySensor) -> ObservationModel:
 # -- demonstrations -----------------------------------------------------------------------------------
 
 
+@shown_briefly
 class NoisyDemonstration(NamedTuple):
     """What an expert did and what perception reported of it.
 
@@ -389,7 +392,7 @@ def demonstrate_noisy(
             if scores == "calibrated"
             else _product(task.predicates, p, g, o)
         )
-        seen = seen._replace(score=np.where(seen.kind == SEEN, score, np.nan))
+        seen = replace(seen, score=np.where(seen.kind == SEEN, score, np.nan))
     return NoisyDemonstration(truth, seen, mdp)
 
 

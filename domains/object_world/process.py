@@ -17,6 +17,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ...models.inputs.display import shown_briefly
+from ...models.process.layout import Layout, Mark
 from ...models.process.mdp import TabularMDP
 
 Cell = tuple[int, int]
@@ -28,6 +30,7 @@ FEATURES = ("at the first object", "at the second object", "moves")
 _MOST_DRAWS = 10_000
 
 
+@shown_briefly
 class ObjectWorld(NamedTuple):
     """A walled grid and what is desired in it.
 
@@ -51,6 +54,13 @@ class ObjectWorld(NamedTuple):
     objects: tuple[Cell, Cell]
     weights: Float[np.ndarray, " K"]
     cells: tuple[Cell, ...]
+
+    @property
+    def layout(self) -> Layout:
+        """The free cells for pictures, with the objects marked."""
+        first, second = self.objects
+        marks = (Mark("1", first, "the first object"), Mark("2", second, "the second object"))
+        return Layout.grid(self.cells, marks=marks)
 
     def state_of(self, cell: Cell) -> int:
         """The state of a free cell. Raises ``ValueError`` for a wall and outside the grid."""

@@ -19,6 +19,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.laws.chain import condition
 from ...models.observation.demonstration import HIDDEN, LOST
 from ...models.observation.evidence import AnySensor, step_log_evidence
@@ -44,6 +45,7 @@ class BreachSettings(NamedTuple):
     rounds: float = 2.0
 
 
+@shown_briefly
 class BreachTask(NamedTuple):
     """The learner's process without time, over ``X`` states (cell, heading) of its ``C`` cells.
 
@@ -68,6 +70,7 @@ class BreachTask(NamedTuple):
     discount: Float[Array, ""]
 
 
+@shown_briefly
 class BreachPlan(NamedTuple):
     """Optimal values ``[T, X]`` at each step of the plan, and the best move (index into ``MOVES``)."""
 

@@ -19,8 +19,10 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import Demonstration
 from ...models.observation.evidence import Visibility, observe
+from ...models.process.layout import Layout, Mark
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import hard_plan, reward_of
 
@@ -55,6 +57,7 @@ class State(NamedTuple):
         return f"({self.row},{self.column}) {HEADINGS[self.heading]}{phase}"
 
 
+@shown_briefly
 class Breach(NamedTuple):
     """Where the learner starts, which way it faces, where it wants to go, and the cells it may use."""
 
@@ -64,6 +67,7 @@ class Breach(NamedTuple):
     discount: float
 
 
+@shown_briefly
 class Patrol(NamedTuple):
     """A patrolling domain.
 
@@ -93,6 +97,26 @@ class Patrol(NamedTuple):
         """Index into :attr:`cells` of each state."""
         index = {cell: i for i, cell in enumerate(self.cells)}
         return np.array([index[state.cell] for state in self.states])
+
+    @property
+    def layout(self) -> Layout:
+        """The floor for pictures: a state at the side of its cell that it faces; a panel for each phase."""
+        phase = [state.phase for state in self.states]
+        phases = max(phase)
+        breach = self.breach
+        marks = [] if breach is None else [
+            Mark("S", breach.start.cell, "the learner's start"),
+            *(Mark("G", goal, "its goal") for goal in breach.goals),
+        ]  # fmt: skip
+        return Layout.grid(
+            [state.cell for state in self.states],
+            headings=np.array([state.heading for state in self.states]) * np.pi / 2,
+            layers=[
+                f"from hallway {s.phase} to {s.phase % phases + 1}" if phases else "" for s in self.states
+            ],
+            marks=marks,
+            floor=() if breach is None else breach.cells,
+        )
 
     def visibility(self, observability: int | None = None) -> Visibility:
         """The learner's view at an observability named by the dissertation (30, 70, 100 percent, ...).

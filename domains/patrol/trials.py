@@ -15,6 +15,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import LOST, UNKNOWN
 from ...models.observation.evidence import Visibility, observe
 from ...models.process.mdp import TabularMDP
@@ -84,6 +85,7 @@ GoRule = GoAtBestTime | GoWhenBest | GoAtRandom
 # -- trials -------------------------------------------------------------------------------------------
 
 
+@shown_briefly
 class BreachOutcome(NamedTuple):
     """How ``n`` runs ended.
 

@@ -27,6 +27,7 @@ from jaxtyping import Array, Bool, Float, Int
 from ...inference.adversarial.policy_optimisation import PPO, Training, ppo
 from ...inference.adversarial.rollouts import Task, play
 from ...models.inputs.archives import StorageError, read_arrays
+from ...models.inputs.display import shown_briefly
 from ...models.inputs.text import parsed_json, shortened
 from ...models.networks.modules import Policy, policy_network
 from ...models.observation.recordings import Recording, recording
@@ -74,6 +75,7 @@ RECIPES = {
 }
 
 
+@shown_briefly
 class Demonstrations(NamedTuple):
     """Episodes of an expert, zero from their end to the common length ``L``.
 

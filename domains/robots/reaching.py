@@ -29,6 +29,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ...models.inputs.display import shown_briefly
 from ...models.networks.environment import Environment
 from ...models.networks.modules import ActionSpace
 from .simulation import Trajectories, simulate
@@ -58,6 +59,7 @@ _START = (0.54, -0.14, 1.0)
 _ROWS = (-0.16, -0.08, 0.01, 0.10, 0.18)
 
 
+@shown_briefly
 class Scene(NamedTuple):
     """An observation taken apart.
 
@@ -112,6 +114,7 @@ def compose(seen: Scene) -> Float[Array, "... 29"]:
     return jnp.concatenate([*arm(seen.wrist), seen.wrist, flat], -1)
 
 
+@shown_briefly
 class Outcome(NamedTuple):
     """What a step came to: the next observation, its reward, and whether all onions are dealt with."""
 
@@ -216,6 +219,7 @@ _UNSTEADY = 0.06
 _LONGEST = 0.45
 
 
+@shown_briefly
 class OnionMover(NamedTuple):
     """Sorts without an error, by the observation alone, somewhat as the recorded person does.
 

@@ -16,6 +16,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.networks.environment import Environment, HostEnvironment
 from ...models.observation.recordings import Recording
 
@@ -39,6 +40,7 @@ class _PerturbedFields(NamedTuple):
     share: Any
 
 
+@shown_briefly
 class Perturbed(_PerturbedFields):
     """A policy that now and then, with probability ``share``, does anything within the bounds instead.
 
@@ -65,6 +67,7 @@ class Perturbed(_PerturbedFields):
         return jnp.where(anything[..., None], drawn, space.clip(own))
 
 
+@shown_briefly
 class Trajectories(NamedTuple):
     """Trajectories of at most ``T`` steps, from first states drawn; after termination nothing is live.
 

@@ -28,6 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from ...extras import required
+from ...models.inputs.display import shown_briefly
 from ...models.networks.modules import ActionSpace
 
 if TYPE_CHECKING:
@@ -73,6 +74,7 @@ class Capsule(NamedTuple):
     radius: float
 
 
+@shown_briefly
 class Locomotion(NamedTuple):
     """One robot's task; made by :func:`locomotion`.
 

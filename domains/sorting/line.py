@@ -39,6 +39,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from scipy.special import ndtri
 
+from ...models.inputs.display import shown_briefly
 from .process import (
     ACTIONS,
     AT_CONVEYOR,
@@ -106,6 +107,7 @@ class Share(NamedTuple):
     high: float
 
 
+@shown_briefly
 class Tally(NamedTuple):
     """How the onions of ``n`` belts ended.
 

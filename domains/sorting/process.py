@@ -30,6 +30,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import deterministic_policy, hard_plan, reward_of, simulate
@@ -88,6 +89,7 @@ class State(NamedTuple):
         return f"{PREDICTION[self.prediction]} {ONION[self.onion]}, {HAND[self.hand]}, {LIST[self.listed]}"
 
 
+@shown_briefly
 class Sorting(NamedTuple):
     """An onion-sorting process and the rewards that sorters follow.
 
@@ -123,6 +125,7 @@ class Sorting(NamedTuple):
         return np.asarray(_greedy(self.mdp, jnp.asarray(self.weights[behaviour])))
 
 
+@shown_briefly
 class MixedDemonstration(NamedTuple):
     """Trajectories done in several ways, and which way each was done (``[n]``, for judging only)."""
 

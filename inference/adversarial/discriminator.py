@@ -13,9 +13,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from ...models.inputs.display import shown_briefly
 from ...models.networks.modules import ActionSpace, Policy, ShapedReward
 
 
+@shown_briefly
 class Transitions(NamedTuple):
     """Steps ``(s, a, s')``, and whether the episode ended there for good.
 
@@ -32,6 +34,7 @@ class Transitions(NamedTuple):
         return Transitions(*(x[chosen] for x in self))
 
 
+@shown_briefly
 class ExpertTransitions(NamedTuple):
     """``M`` samples of the truth behind each of ``N`` reported steps.
 
@@ -47,6 +50,7 @@ class ExpertTransitions(NamedTuple):
     weights: Array
 
 
+@shown_briefly
 class Discriminator(NamedTuple):
     """A classifier whose log-odds are a reward.
 
@@ -192,6 +196,7 @@ def log_probability_of_mean(logits: Float[Array, "B M"], weights: Float[Array, "
 AVERAGES = {"log_probabilities": mean_log_probability, "logits": log_probability_of_mean}
 
 
+@shown_briefly
 class Losses(NamedTuple):
     """What one update of the discriminator met: mean cross-entropy (nats), and the share told right."""
 

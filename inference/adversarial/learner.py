@@ -24,6 +24,7 @@ from jaxtyping import Array, Float, Int
 
 from ...extras import required
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.networks.modules import DTYPE, ActionSpace, Policy, ShapedReward
 from ...models.observation.recordings import Recording, require_recording
 from ..sessions.learner import Learner
@@ -49,6 +50,7 @@ else:
     eqx, optax = required("equinox"), required("optax")
 
 
+@shown_briefly
 class Task(NamedTuple):
     """What a learner is about where there is no :class:`TabularMDP`: sizes and a name, for its journal."""
 
@@ -73,6 +75,7 @@ class Task(NamedTuple):
         return hashlib.sha256(json.dumps(tuple(self)).encode()).hexdigest()
 
 
+@shown_briefly
 class AdversarialState(NamedTuple):
     """All that is carried from session to session.
 
@@ -105,6 +108,7 @@ class AdversarialState(NamedTuple):
         return np.concatenate([np.ravel(x) for x in jax.tree.leaves(parameters)])
 
 
+@shown_briefly
 class AdversarialInfo(NamedTuple):
     """What a session did.
 

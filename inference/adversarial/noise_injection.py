@@ -29,6 +29,7 @@ from numpy.typing import ArrayLike
 
 from ...extras import required
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.networks.environment import Environment, HostEnvironment, Rollout
 from ...models.networks.modules import DTYPE, MLP, ActionSpace, Policy, ShapedReward
 from ...models.observation.recordings import Recording
@@ -105,6 +106,7 @@ def _replace(replaced: Any, random: Any, intended: Any) -> Any:
 # -- acting with noise ------------------------------------------------------------------------------------
 
 
+@shown_briefly
 class NoisyRollout(NamedTuple):
     """What an agent did while some of its actions were replaced.
 

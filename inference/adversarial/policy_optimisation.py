@@ -30,6 +30,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from ...extras import required
+from ...models.inputs.display import shown_briefly
 from ...models.networks.environment import Environment, Rollout
 from ...models.networks.modules import DTYPE, MLP, CategoricalPolicy, GaussianPolicy, Policy, RunningNorm
 from .rollouts import Episodes, Running, Task, begin, finished_returns, play, roll_out
@@ -85,6 +86,7 @@ class Settings(NamedTuple):
         return self.n_envs * self.n_steps
 
 
+@shown_briefly
 class ReturnScale(NamedTuple):
     """The spread of discounted returns so far.
 
@@ -98,6 +100,7 @@ class ReturnScale(NamedTuple):
     norm: RunningNorm
 
 
+@shown_briefly
 class PPOState(NamedTuple):
     """An agent in the middle of its episodes: all that is needed to go on.
 
@@ -121,6 +124,7 @@ class PPOState(NamedTuple):
     key: Array
 
 
+@shown_briefly
 class Training(NamedTuple):
     """How training went, one entry for each rollout.
 
@@ -136,6 +140,7 @@ class Training(NamedTuple):
     episodes: Int[np.ndarray, " U"]
 
 
+@shown_briefly
 class PPO(NamedTuple):
     """An agent: its task, its settings, and its functions; made by :func:`ppo`.
 
@@ -205,6 +210,7 @@ def advantages(
     return lax.scan(back, jnp.zeros_like(surprises[0]), (surprises, onwards), reverse=True)[1]
 
 
+@shown_briefly
 class Sample(NamedTuple):
     """What a gradient is taken of: steps of a rollout with their estimates, ``[m, ...]``."""
 

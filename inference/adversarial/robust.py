@@ -23,6 +23,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ...models.inputs.display import shown_briefly
 from ...models.networks.modules import Policy
 from ...models.observation.recordings import (
     GaussianSensor,
@@ -38,6 +39,7 @@ from .discriminator import Discriminator, ExpertTransitions, Transitions, airl_d
 from .learner import AdversarialTraining, adversarial
 
 
+@shown_briefly
 class Look(NamedTuple):
     """The chain, and the policy it was last looked at under (None before the first look)."""
 
@@ -45,6 +47,7 @@ class Look(NamedTuple):
     policy: Policy | None
 
 
+@shown_briefly
 class Smoothed(NamedTuple):
     """The truth by smoothing, the sensor being known.
 
@@ -87,6 +90,7 @@ class Smoothed(NamedTuple):
         return sensor
 
 
+@shown_briefly
 class SmoothedAndFitted(NamedTuple):
     """The truth by smoothing, the sensor being fitted in every session.
 

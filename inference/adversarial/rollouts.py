@@ -18,6 +18,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.networks.environment import Environment, HostEnvironment, Rollout
 from ...models.networks.modules import DTYPE, MLP, CategoricalPolicy, GaussianPolicy, Policy
 
@@ -25,6 +26,7 @@ Task = Environment | HostEnvironment
 _SPARE_STARTS = 32
 
 
+@shown_briefly
 class Running(NamedTuple):
     """Episodes under way, side by side.
 
@@ -40,6 +42,7 @@ class Running(NamedTuple):
     returns: Float[Array, " n"]
 
 
+@shown_briefly
 class Episodes(NamedTuple):
     """Whole episodes from their first states, side by side.
 

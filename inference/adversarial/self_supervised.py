@@ -21,6 +21,7 @@ from jaxtyping import Array, Bool, Float, Int
 from scipy.optimize import isotonic_regression, least_squares
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.networks.environment import Environment, HostEnvironment, Rollout
 from ...models.networks.modules import DTYPE, ShapedReward
 from ...models.observation.recordings import Recording
@@ -40,6 +41,7 @@ MOST = np.array([1.5, 1.0, 2.0, -1e-3])
 _STARTS = [(x0, 0.0, 1.0, k) for x0 in (0.1, 0.4, 0.7) for k in (-3.0, -15.0)]
 
 
+@shown_briefly
 class NoiseCurve(NamedTuple):
     """Performance as a decreasing function of the noise in the actions.
 
@@ -228,6 +230,7 @@ class SSRRTraining(NamedTuple):
         return self
 
 
+@shown_briefly
 class SSRRState(NamedTuple):
     """All that is carried from session to session.
 
@@ -254,6 +257,7 @@ class SSRRState(NamedTuple):
         return np.concatenate([np.ravel(x) for x in jax.tree.leaves(self.network.members)])
 
 
+@shown_briefly
 class SSRRInfo(NamedTuple):
     """What a session did.
 

@@ -16,6 +16,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ...extras import required
+from ...models.inputs.display import shown_briefly
 from ...models.networks.modules import DTYPE, MLP, RunningNorm
 
 if TYPE_CHECKING:
@@ -118,6 +119,7 @@ class SSRRReward(eqx.Module):
         return self.each(observations).mean(0)
 
 
+@shown_briefly
 class Ranked(NamedTuple):
     """Trajectories of known worth.
 
@@ -134,6 +136,7 @@ class Ranked(NamedTuple):
     worth: Float[Array, " n"]
 
 
+@shown_briefly
 class Snippets(NamedTuple):
     """Stretches of trajectories, arrays ``[m]``; ``label`` is what their rewards should sum to."""
 
@@ -143,6 +146,7 @@ class Snippets(NamedTuple):
     label: Float[Array, " m"]
 
 
+@shown_briefly
 class Fit(NamedTuple):
     """Mean squared errors of each network, ``[E]``: on the last batch, and on the snippets held out."""
 

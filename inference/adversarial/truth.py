@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from ...models.inputs.display import shown_briefly
 from ...models.networks.modules import ActionSpace, Policy
 from ...models.observation.recordings import Recording
 from .discriminator import ExpertTransitions, Transitions
@@ -65,6 +66,7 @@ class FaceValue:
         return sensor
 
 
+@shown_briefly
 class Sampled(NamedTuple):
     """What a look at a session's reports found.
 

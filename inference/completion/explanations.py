@@ -15,12 +15,14 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration
 from ...models.observation.evidence import AnySensor, fitting_sensor
 from ...models.process.mdp import TabularMDP
 from .smoothing import Evidence, evidence_of, smooth_all
 
 
+@shown_briefly
 class SeenWhole(NamedTuple):
     """Fully seen trajectories: visits, log-probability of what no reward changes, and which rows exist."""
 
@@ -29,6 +31,7 @@ class SeenWhole(NamedTuple):
     live: Bool[Array, " n"]
 
 
+@shown_briefly
 class SeenInPart(NamedTuple):
     """Trajectories with gaps or noise: evidence of every step, which steps were seen, which rows exist."""
 
@@ -40,6 +43,7 @@ class SeenInPart(NamedTuple):
 Trajectories = SeenWhole | SeenInPart
 
 
+@shown_briefly
 class Explained(NamedTuple):
     """A jumble under one way of doing the task.
 
@@ -60,7 +64,7 @@ class Explained(NamedTuple):
 
 def is_seen_whole(sensor: AnySensor, demonstration: Demonstration) -> bool:
     """Whether every step was perceived exactly, state and action."""
-    kind, state, action, _ = (np.asarray(x) for x in demonstration)
+    kind, state, action, _ = (np.asarray(x) for x in demonstration.arrays)
     gaps = (kind == HIDDEN) | (kind == LOST) | ((kind == SEEN) & ((state == UNKNOWN) | (action == UNKNOWN)))
     return sensor.noise is None and not gaps.any()
 
@@ -68,7 +72,7 @@ def is_seen_whole(sensor: AnySensor, demonstration: Demonstration) -> bool:
 def seen_whole(mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration) -> SeenWhole:
     """Gather the visits of fully seen trajectories; traceable."""
     sensor = fitting_sensor(sensor, mdp)
-    kind, state, action, _ = (jnp.asarray(x) for x in demonstration)
+    kind, state, action, _ = (jnp.asarray(x) for x in demonstration.arrays)
     present = jnp.ones(mdp.n_states) if sensor.visibility is None else sensor.visibility
 
     def one(kind: Int[Array, " L"], state: Int[Array, " L"], action: Int[Array, " L"]) -> tuple:

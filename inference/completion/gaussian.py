@@ -30,6 +30,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from ...models.inputs.arguments import as_key, described
+from ...models.inputs.display import shown_briefly
 from ...models.observation.recordings import (
     GaussianSensor,
     Recording,
@@ -73,6 +74,7 @@ class Dynamics(Protocol):
         """Derivatives by the state, ``[n, d, d]``, and by the action, ``[n, d, k]``."""
 
 
+@shown_briefly
 class JaxDynamics(NamedTuple):
     """Compiled dynamics; made by :func:`jax_dynamics`."""
 
@@ -85,6 +87,7 @@ def jax_dynamics(f: Callable[[Array, Array], Array]) -> JaxDynamics:
     return JaxDynamics(jax.jit(jax.vmap(f)), jax.jit(jax.vmap(jax.jacfwd(f, (0, 1)))))
 
 
+@shown_briefly
 class TruthChain(NamedTuple):
     """What is kept between calls: the reports, the posterior so far and the dynamics linearised across it.
 
@@ -112,6 +115,7 @@ class TruthChain(NamedTuple):
     passes: Int[Array, ""]
 
 
+@shown_briefly
 class Bounds(NamedTuple):
     """Within which the pairs ``(s, a)`` lie, ``[D]`` or a number."""
 
@@ -119,6 +123,7 @@ class Bounds(NamedTuple):
     high: Float[Array, "*D"]
 
 
+@shown_briefly
 class Model(NamedTuple):
     """The law of the truth but for the policy: ``Q [d, d]`` and the Gaussian of ``s_0``."""
 
@@ -312,6 +317,7 @@ def log_joint(
     )
 
 
+@shown_briefly
 class GaussianTruth(NamedTuple):
     """Smoothing and joint draws of the truth behind a recording; made by :func:`gaussian_truth`.
 

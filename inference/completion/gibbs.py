@@ -27,6 +27,7 @@ from jax.scipy.linalg import cho_solve, solve_triangular
 from jaxtyping import Array, Float, Int
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.observation.recordings import GaussianSensor, Recording, Truths, log_normal, truths
 from .gaussian import (
     GaussianTruth,
@@ -53,6 +54,7 @@ FROZEN = 0.01
 """Mobility below which a step counts as frozen."""
 
 
+@shown_briefly
 class GibbsChain(NamedTuple):
     """The reports, ``M`` draws of the truth, and how they moved.
 
@@ -243,6 +245,7 @@ def _log_acceptance(
     return gain + back - there
 
 
+@shown_briefly
 class GaussianGibbs(NamedTuple):
     """``init(recording, sensor) -> chain``, ``refresh(chain, policy, key, sensor) -> (chain, truths)``.
 

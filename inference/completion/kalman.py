@@ -18,7 +18,10 @@ from jax import lax
 from jax.scipy.linalg import cho_solve
 from jaxtyping import Array, Bool, Float
 
+from ...models.inputs.display import shown_briefly
 
+
+@shown_briefly
 class AffineGaussian(NamedTuple):
     """An affine-Gaussian chain of ``L`` steps.
 
@@ -41,6 +44,7 @@ class AffineGaussian(NamedTuple):
     reading_noise: Float[Array, "L m m"]
 
 
+@shown_briefly
 class GaussianFiltered(NamedTuple):
     """Forward pass, and the law of each state given the next: ``x_t | x_{t+1}, y_{0:t} ~
     N(means_t + gains_t (x_{t+1} - predicted_{t+1}), conditional_t)``.
@@ -63,6 +67,7 @@ class GaussianFiltered(NamedTuple):
     conditional: Float[Array, "T D D"]
 
 
+@shown_briefly
 class GaussianSmoothed(NamedTuple):
     """Posterior of a chain given all readings.
 

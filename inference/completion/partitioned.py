@@ -26,6 +26,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 from scipy import ndimage, sparse
 
+from ...models.inputs.display import shown_briefly
 from ...models.laws.chain import Filtered, filter_all, sample_backward, smooth_all
 from ...models.observation.recordings import FiniteSensor, Recording, ShiftSensor, Truths, truths
 from ...models.process.mdp import TabularMDP
@@ -34,6 +35,7 @@ DynamicsOfActions = Callable[[Array, Array], Array]
 """Next states ``[..., d]`` after states ``[..., d]`` and numbered actions ``[...]``, in JAX."""
 
 
+@shown_briefly
 class CandidatePosterior(NamedTuple):
     """Which of a report's truths it was.
 
@@ -93,6 +95,7 @@ def _draw_candidates(key: Array, chain: _Moves, alpha: Float[Array, "L K"]) -> A
     return jnp.concatenate([rest, last[None]])
 
 
+@shown_briefly
 class Box(NamedTuple):
     """Where states can be, ``[d]`` each."""
 
@@ -150,6 +153,7 @@ def _candidate_draws(key: Array, chains: _Moves, places: Array, draws: int) -> F
     return jax.vmap(one, out_axes=1)(jax.random.split(key, len(places)), chains, places)
 
 
+@shown_briefly
 class CandidateTruth(NamedTuple):
     """``init(recording, sensor) -> chain``, ``refresh(chain, policy, key, sensor) -> (chain, truths)``.
 
@@ -217,6 +221,7 @@ def fitted_shift_sensor(
     return sensor._replace(probability=jnp.clip(share, 1e-6, 1 - 1e-6))
 
 
+@shown_briefly
 class Partition(NamedTuple):
     """A space cut into cells.
 
@@ -306,6 +311,7 @@ def _grid(marks: Array, d: int) -> Float[Array, "N d"]:
     return jnp.stack(jnp.meshgrid(*[marks] * d, indexing="ij"), -1).reshape(-1, d).astype(float)
 
 
+@shown_briefly
 class PartitionTruth(NamedTuple):
     """The dissertation's Technique 1: as :class:`CandidateTruth`, by way of cells."""
 

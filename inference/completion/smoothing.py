@@ -16,6 +16,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.laws import chain
 from ...models.laws.chain import Filtered, Smoothed, filter_all, filter_forward, sample_backward
 from ...models.observation.demonstration import PAD, Demonstration
@@ -23,6 +24,7 @@ from ...models.observation.evidence import AnySensor, log_evidence
 from ...models.process.mdp import TabularMDP
 
 
+@shown_briefly
 class Evidence(NamedTuple):
     """A demonstration as a learner uses it: ``log e_t(s, a)`` as ``[n, L, S, A]`` and which steps exist."""
 
@@ -30,6 +32,7 @@ class Evidence(NamedTuple):
     live: Bool[Array, "n L"]
 
 
+@shown_briefly
 class Expectations(NamedTuple):
     """Expected sufficient statistics of a demonstration, hidden steps averaged over their posterior.
 
@@ -228,6 +231,7 @@ def gibbs_completions(
     return jax.vmap(chain, out_axes=1)(keys, *evidence)
 
 
+@shown_briefly
 class Settled(NamedTuple):
     """Completions drawn until an average of them settled.
 

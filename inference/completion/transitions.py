@@ -15,6 +15,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from ...models.inputs.display import shown_briefly
 from ...models.laws.chain import smooth_transitions_all
 from ...models.observation.demonstration import SEEN, Demonstration
 from ...models.process.mdp import TabularMDP
@@ -22,6 +23,7 @@ from ...models.process.planning import occupancy
 from .smoothing import Evidence, gibbs_completions, log_likelihoods, settled_completions
 
 
+@shown_briefly
 class Completed(NamedTuple):
     """A session's demonstration as transitions.
 
@@ -40,6 +42,7 @@ class Completed(NamedTuple):
     starts: Float[Array, "H S"]
 
 
+@shown_briefly
 class TransitionStatistic(NamedTuple):
     """The expert's transitions so far, means per step.
 
@@ -138,7 +141,7 @@ def reported_transitions(
     the next report names no state that could follow, or there is none, the successor is distributed as the
     dynamics have it. The log-likelihood is that of the reported actions, given the reported states.
     """
-    kind, state, action = (jnp.asarray(x) for x in demonstration[:3])
+    kind, state, action = (jnp.asarray(x) for x in demonstration.arrays[:3])
     s, a = jnp.maximum(state, 0), jnp.maximum(action, 0)
     in_range = (state >= 0) & (state < mdp.n_states) & (action >= 0) & (action < mdp.n_actions)
     seen = (kind == SEEN) & in_range & mdp.available[s, a]

@@ -40,6 +40,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import numpy as np
 
+from ...models.inputs.display import shown_briefly
 from ...models.inputs.text import shortened
 from ..sessions.serialization import DIGEST_SIZE, Leaf, decode, encode, restore
 from .locking import (
@@ -122,6 +123,7 @@ class Position(NamedTuple):
         return Position(self.records + 1, hashlib.sha256(content).hexdigest())
 
 
+@shown_briefly
 class SessionRecord(NamedTuple):
     """One committed session.
 

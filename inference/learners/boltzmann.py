@@ -96,7 +96,7 @@ def visit_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.ndar
     part (these methods need to see every step), for an index that is no state or action, and for an action
     that is not available; and without a step in any trajectory.
     """
-    kind, state, action, _ = checked_demonstration(mdp, demonstration)
+    kind, state, action, _ = checked_demonstration(mdp, demonstration).arrays
     live = kind != PAD
     if not live.any():
         raise DemonstrationError("the demonstration has no step; this method needs at least one trajectory")

@@ -34,6 +34,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
 from ...models.observation.evidence import Sensor, checked_demonstration, require_possible
 from ...models.process.mdp import Labels, TabularMDP
@@ -44,6 +45,7 @@ from ..sessions.scaling import on_scaled_features
 from ..sessions.statistic import FEATURES, FeatureStatistic, complete
 
 
+@shown_briefly
 class DarkoState(NamedTuple):
     """What DARKO carries on.
 
@@ -57,6 +59,7 @@ class DarkoState(NamedTuple):
     session: Int[Array, ""]
 
 
+@shown_briefly
 class Margin(NamedTuple):
     """A session under some weights: ``margin [K]``, ``E[phi | pi] - phi_hat``, and what it was made of.
 
@@ -276,7 +279,7 @@ def goal_sessions(stream: Iterable[Demonstration], goals: Bool[np.ndarray, " S"]
 
 def _row(codes: list[np.ndarray], scores: list[float]) -> Demonstration:
     row = Demonstration.from_codes(np.array(codes)[None])
-    return row._replace(score=np.array(scores, float)[None]).bucketed()
+    return replace(row, score=np.array(scores, float)[None]).bucketed()
 
 
 def stopping_places(stream: Iterable[Demonstration], n_states: int, steps: int) -> Bool[np.ndarray, " S"]:
@@ -350,6 +353,6 @@ def with_end(session: Demonstration, end: int) -> Demonstration:
     n, width = session.kind.shape
     longer = session.padded(n, width + 1)
     rows, at = np.arange(n), longer.lengths
-    for array, value in zip(longer, (SEEN, end, UNKNOWN, np.nan), strict=True):
+    for array, value in zip(longer.arrays, (SEEN, end, UNKNOWN, np.nan), strict=True):
         array[rows, at] = value
     return longer

@@ -22,6 +22,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted
@@ -41,6 +42,7 @@ from .boltzmann import (
 _WIDEST = 0.5
 
 
+@shown_briefly
 class Seating(NamedTuple):
     """State of the sampler.
 
@@ -61,6 +63,7 @@ class Seating(NamedTuple):
     log_policies: Float[Array, "n S A"]
 
 
+@shown_briefly
 class Settings(NamedTuple):
     """Numbers of the model and its sampler; see :func:`dpm_birl`."""
 
@@ -69,6 +72,7 @@ class Settings(NamedTuple):
     sigma: Float[Array, ""]
 
 
+@shown_briefly
 class DPMTrace(NamedTuple):
     """Every sweep of the sampler, the random seating it starts from left out.
 
@@ -93,6 +97,7 @@ class DPMTrace(NamedTuple):
     weight_acceptance: Float[np.ndarray, " sweeps"]
 
 
+@shown_briefly
 class DPMBIRL(NamedTuple):
     """DPM-BIRL on one decision process.
 

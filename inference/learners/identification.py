@@ -20,6 +20,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import SEEN, Demonstration, DemonstrationError
 from ...models.observation.evidence import (
     AnySensor,
@@ -42,6 +43,7 @@ _ERRS = 1e-3
 _ITERATIONS = 100
 
 
+@shown_briefly
 class SensorIdentification(NamedTuple):
     """How far agreement depends on what is assumed of the expert.
 

@@ -27,6 +27,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import SEEN, UNKNOWN, Demonstration, DemonstrationError
 from ...models.observation.evidence import checked_demonstration
 from ...models.process.mdp import Labels, TabularMDP
@@ -41,6 +42,7 @@ from ..sessions.learner import Learner, SessionInfo
 from ..sessions.scaling import on_scaled_features
 
 
+@shown_briefly
 class JinState(NamedTuple):
     """What the method carries on: ``weights [K]``, the reward; an empty statistic; sessions so far."""
 
@@ -49,6 +51,7 @@ class JinState(NamedTuple):
     session: Int[Array, ""]
 
 
+@shown_briefly
 class Correction(NamedTuple):
     """What a pair says about a reward: ``direction [K]`` (``v_i``) and whether the prediction was wrong."""
 
@@ -166,7 +169,7 @@ def _learner(name: str, mdp: TabularMDP, learning_rate: float) -> Learner:
 def _session(
     mdp: TabularMDP, step_size: Float[Array, ""], state: JinState, demonstration: Demonstration
 ) -> tuple[JinState, SessionInfo]:
-    kind, states, actions = (jnp.asarray(x).reshape(-1) for x in demonstration[:3])
+    kind, states, actions = (jnp.asarray(x).reshape(-1) for x in demonstration.arrays[:3])
     full = (kind == SEEN) & (states != UNKNOWN) & (actions != UNKNOWN)
     in_range = (states >= 0) & (states < mdp.n_states) & (actions >= 0) & (actions < mdp.n_actions)
 
@@ -200,7 +203,7 @@ def _session(
 
 
 def _require_available(mdp: TabularMDP, demonstration: Demonstration) -> None:
-    kind, states, actions, _ = demonstration
+    kind, states, actions, _ = demonstration.arrays
     full = (kind == SEEN) & (states != UNKNOWN) & (actions != UNKNOWN)
     if not full.any():
         raise DemonstrationError("a session needs at least one step seen in full, its state and its action")

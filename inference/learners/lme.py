@@ -19,6 +19,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import SEEN as SEEN_STEP
 from ...models.observation.demonstration import Demonstration, DemonstrationError
 from ...models.observation.evidence import (
@@ -55,6 +56,7 @@ DEFAULT_SLACK = 0.002
 DEFAULT_DRAWS = 957
 
 
+@shown_briefly
 class LMEState(NamedTuple):
     """What LME-I2RL carries from session to session (Definition 7).
 
@@ -439,6 +441,7 @@ def _learner(
 # -- batch --------------------------------------------------------------------------------------------
 
 
+@shown_briefly
 class BatchFit(NamedTuple):
     """Result of batch LME.
 
@@ -463,6 +466,7 @@ class BatchFit(NamedTuple):
     converged: Bool[np.ndarray, " restarts"]
 
 
+@shown_briefly
 class Batch(NamedTuple):
     """Batch LME on one decision process; ``fit(key, demonstration)`` uses all trajectories at once."""
 

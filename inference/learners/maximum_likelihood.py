@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Float, Int
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted
@@ -34,6 +35,7 @@ from .boltzmann import (
 )
 
 
+@shown_briefly
 class MLIRLFit(NamedTuple):
     """Result of MLIRL.
 
@@ -55,6 +57,7 @@ class MLIRLFit(NamedTuple):
     iterations: Int[np.ndarray, " restarts"]
 
 
+@shown_briefly
 class Ascent(NamedTuple):
     """A point of the projected gradient ascent: value and gradient there, and the step to try next."""
 
@@ -176,6 +179,7 @@ def require_components(n_components: int, trajectories: int) -> None:
 # -- mixture ------------------------------------------------------------------------------------------
 
 
+@shown_briefly
 class Mixture(NamedTuple):
     """Parameters of a mixture of Boltzmann experts: ``weights [D, K]``, ``proportions [D]``."""
 
@@ -183,6 +187,7 @@ class Mixture(NamedTuple):
     proportions: Float[Array, " D"]
 
 
+@shown_briefly
 class EMTrace(NamedTuple):
     """All that an EM fit computed.
 
@@ -198,6 +203,7 @@ class EMTrace(NamedTuple):
     log_likelihoods: Float[np.ndarray, "restarts iterations"]
 
 
+@shown_briefly
 class EMMLIRL(NamedTuple):
     """EM-MLIRL on one decision process: ``fit(key, demonstration)`` uses all trajectories at once.
 

@@ -20,6 +20,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import Demonstration, DemonstrationError
 from ...models.observation.evidence import (
     AnySensor,
@@ -54,6 +55,7 @@ DEFAULT_RIDGE = 0.02
 _FEWEST_ROWS = 32
 
 
+@shown_briefly
 class MixtureState(NamedTuple):
     """What online MME-MTIRL carries from session to session (section 5.2). Empty slots have no mass.
 
@@ -84,6 +86,7 @@ class MixtureState(NamedTuple):
     key: Array
 
 
+@shown_briefly
 class MixtureInfo(NamedTuple):
     """What a session did; fields as in :class:`~i2rl.inference.SessionInfo`, where not said otherwise.
 
@@ -249,6 +252,7 @@ def _learner(
     )
 
 
+@shown_briefly
 class BatchMixture(NamedTuple):
     """Batch multi-task IRL; ``fit(key, demonstration)`` uses all trajectories at once."""
 

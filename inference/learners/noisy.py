@@ -23,6 +23,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import SEEN, Demonstration, DemonstrationError
 from ...models.observation.evidence import (
     AnySensor,
@@ -72,6 +73,7 @@ DEFAULT_FORGETTING = 0.8
 DEFAULT_START = 0.75
 
 
+@shown_briefly
 class RIMEOState(NamedTuple):
     """What RIMEO carries from session to session: ``(|Xi|, P*, phi_hat)`` and the reward.
 
@@ -103,6 +105,7 @@ class RIMEOState(NamedTuple):
     key: Array
 
 
+@shown_briefly
 class RIMEOInfo(NamedTuple):
     """Numbers of a session, those of :class:`~i2rl.inference.SessionInfo` and of the sensor that was learned.
 

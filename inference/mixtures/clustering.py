@@ -7,7 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float, Int
 
+from ...models.inputs.display import shown_briefly
 
+
+@shown_briefly
 class Clustering(NamedTuple):
     """Ways of doing a task, found in a jumble of trajectories.
 

@@ -31,6 +31,7 @@ from jax import lax
 from jax.scipy.special import xlogy
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import reward_of, soft_plan
 from ..completion.explanations import Trajectories, explain_each
@@ -38,6 +39,7 @@ from ..programs.entropic import entropic_proportions
 from ..programs.maximum_entropy import WarmStart, fit_scaled_counts
 
 
+@shown_briefly
 class MixtureProgram(NamedTuple):
     """What is being solved: see the module's formula; features of ``mdp`` are scaled.
 
@@ -54,6 +56,7 @@ class MixtureProgram(NamedTuple):
     tolerance: Array | float
 
 
+@shown_briefly
 class Kept(NamedTuple):
     """What is kept of earlier trajectories: how many were done each way, and the visits they made."""
 
@@ -61,6 +64,7 @@ class Kept(NamedTuple):
     visits: Float[Array, "D S A"]
 
 
+@shown_briefly
 class Mixture(NamedTuple):
     """Ways of doing the task; a way without proportion is an empty slot."""
 
@@ -69,6 +73,7 @@ class Mixture(NamedTuple):
     proportions: Float[Array, " D"]
 
 
+@shown_briefly
 class Fit(NamedTuple):
     """A mixture, what it makes of the jumble, and what finding it took.
 
@@ -140,6 +145,7 @@ def _finite_log(p: Array) -> Array:
     return jnp.where(p > 0, jnp.log(jnp.where(p > 0, p, 1.0)), 0.0)
 
 
+@shown_briefly
 class Assigned(NamedTuple):
     """Who did what: responsibilities, what each trajectory adds to ``J``, its log-likelihood."""
 

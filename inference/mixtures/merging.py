@@ -16,6 +16,7 @@ from jax import lax
 from jax.scipy.special import xlogy
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.process.planning import hard_plan, reward_of, soft_plan
 from ..completion.explanations import (
     Explained,
@@ -239,6 +240,7 @@ def _seeded(
     return shares, jnp.einsum("nd,nsa->dsa", shares, guess.visits)
 
 
+@shown_briefly
 class Search(NamedTuple):
     """The best fit, and how many starts were tried."""
 

@@ -18,6 +18,8 @@ from numpyro.infer import NUTS
 from numpyro.infer.hmc import HMCState
 from scipy import optimize
 
+from ...models.inputs.display import shown_briefly
+
 # The metric NUTS starts from may stretch its longest axis this much over its shortest, no more: the
 # curvature at the mode says nothing about how far a prior with a kink or a saturated likelihood reaches.
 _MAX_STRETCH = 10.0
@@ -25,6 +27,7 @@ _MAX_STRETCH = 10.0
 Drawn = TypeVar("Drawn")
 
 
+@shown_briefly
 class Transitions(NamedTuple):
     """What NUTS did for each draw of a chain.
 
@@ -100,6 +103,7 @@ def in_threads(run: Callable[..., Drawn], arguments: Sequence[tuple]) -> Drawn:
         return jax.tree.map(lambda *xs: np.stack(xs), *[job.result() for job in jobs])
 
 
+@shown_briefly
 class Mode(NamedTuple):
     """Where NUTS starts: the mode of the unconstrained density and a covariance from its curvature."""
 

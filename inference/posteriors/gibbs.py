@@ -22,6 +22,7 @@ from jax.scipy.special import gammaln
 from jaxtyping import Array, Float, Int
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.laws.mixture import (
     COMPONENTS,
     component_log_likelihoods,
@@ -38,6 +39,7 @@ from .mixture_problem import MixtureProblem, Start, in_threads, mixture_data, po
 _CONCENTRATION_MOVES = 5
 
 
+@shown_briefly
 class Reference(NamedTuple):
     """The Gaussian that elliptical slices are cut by: mean and Cholesky factor over unconstrained weights."""
 
@@ -45,6 +47,7 @@ class Reference(NamedTuple):
     scale_tril: Float[Array, "D D"]
 
 
+@shown_briefly
 class Seating(NamedTuple):
     """State of the sampler.
 
@@ -65,6 +68,7 @@ class Seating(NamedTuple):
     concentration: Float[Array, ""]
 
 
+@shown_briefly
 class Seated(NamedTuple):
     """A draw: ``assignment [n]``, ``weights [n, K]`` by slot, ``concentration``, and slice evaluations."""
 

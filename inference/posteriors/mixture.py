@@ -20,6 +20,7 @@ from numpyro.distributions import constraints
 from numpyro.infer import NUTS
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.laws.mixture import COMPONENTS, stick_proportions
 from ...models.observation.demonstration import Demonstration
 from ...models.observation.evidence import AnySensor
@@ -37,6 +38,7 @@ from .mixture_problem import (
 )
 
 
+@shown_briefly
 class MixtureChain(NamedTuple):
     """One chain of NUTS.
 

@@ -17,6 +17,7 @@ from jaxtyping import Array, Float, Int
 from numpyro.infer.util import potential_energy
 from scipy import optimize
 
+from ...models.inputs.display import shown_briefly
 from ...models.laws.chain import smooth_all
 from ...models.laws.mixture import (
     Perceived,
@@ -46,6 +47,7 @@ from .weights import described_prior, fingerprint
 _MOST_STARTING_WAYS = 6
 
 
+@shown_briefly
 class MixtureProblem(NamedTuple):
     """Arguments of :func:`mixture_model`, trajectories prepared; ``rows`` finds each among them.
 
@@ -60,6 +62,7 @@ class MixtureProblem(NamedTuple):
     concentration: Float[Array, ""] | dist.Distribution
 
 
+@shown_briefly
 class Resolved(NamedTuple):
     """What belongs to each draw of weights and proportions.
 
@@ -131,6 +134,7 @@ def resolve(
 resolve_jit = jax.jit(resolve)
 
 
+@shown_briefly
 class Start(NamedTuple):
     """Where a chain starts: the way of each trajectory (the first has most), and unconstrained weights."""
 

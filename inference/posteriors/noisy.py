@@ -21,6 +21,7 @@ from numpyro.infer import NUTS
 from numpyro.infer.util import potential_energy
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.laws.noisy_behaviour import noisy_behaviour_model, reliabilities_prior
 from ...models.laws.trajectory import TrajectoryLaw
 from ...models.observation.demonstration import Demonstration
@@ -41,6 +42,7 @@ from .weights import described_prior, fingerprint, gather
 _NEGLIGIBLE = float(np.log(100.0))
 
 
+@shown_briefly
 class NoisyProblem(NamedTuple):
     """Arguments of :func:`noisy_behaviour_model`, identical trajectories gathered."""
 
@@ -54,6 +56,7 @@ class NoisyProblem(NamedTuple):
     reliability_prior: dist.Distribution
 
 
+@shown_briefly
 class NoisyChain(NamedTuple):
     """One chain of NUTS: ``weights [draws, K]``, ``reliabilities [draws, J]`` and what the sampler did."""
 

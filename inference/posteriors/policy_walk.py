@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.laws.occlusion import weights_prior
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
@@ -40,6 +41,7 @@ from .weights import described_prior
 _TARGET_ACCEPT = 0.3
 
 
+@shown_briefly
 class Walk(NamedTuple):
     """Draws of the chains; every field has leading dimensions ``[chains, draws]``.
 

@@ -24,6 +24,7 @@ from numpyro.infer import NUTS
 from numpyro.infer.util import potential_energy
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.laws.chain import filter_all, sample_backward
 from ...models.laws.occlusion import ScaledPrior, occlusion_model, scaled_prior
 from ...models.observation.demonstration import PAD, UNKNOWN, Demonstration
@@ -40,6 +41,7 @@ from ..completion.smoothing import Evidence, evidence_of, log_likelihoods
 from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
 
 
+@shown_briefly
 class Problem(NamedTuple):
     """Arguments of :func:`occlusion_model`, identical trajectories gathered."""
 
@@ -50,6 +52,7 @@ class Problem(NamedTuple):
     prior: dist.Distribution
 
 
+@shown_briefly
 class Chain(NamedTuple):
     """One chain of NUTS: ``weights [draws, K]`` and what the sampler did."""
 
@@ -100,6 +103,7 @@ run_nuts_chain = jax.jit(nuts_chain, static_argnames=("warmup", "draws", "target
 _potential_and_gradient = jax.jit(jax.value_and_grad(potential))
 
 
+@shown_briefly
 class Completions(NamedTuple):
     """One joint completion of each trajectory for each draw of the weights.
 

@@ -10,6 +10,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 from scipy import sparse
 
+from ...models.inputs.display import shown_briefly
 from ...models.process.mdp import PairNames, TabularMDP
 from ...models.process.planning import reachable_states, require_discounted
 from ...models.process.units import feature_scale, with_scaled_features
@@ -28,6 +29,7 @@ class InfeasibleProgram(ValueError):
     """No policy meets the feature constraints; the message names the features and by how much they miss."""
 
 
+@shown_briefly
 class FeatureTarget(NamedTuple):
     """What the feature program has to match.
 
@@ -97,6 +99,7 @@ def _feature_name(mdp: TabularMDP, k: int) -> str:
     return f"{mdp.feature_names[k]!r} ({k})"
 
 
+@shown_briefly
 class FlowConstraints(NamedTuple):
     """The polytope of occupancies: ``x >= 0``, ``balance @ x = p0``, over the pairs that can occur.
 

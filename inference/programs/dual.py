@@ -11,6 +11,7 @@ from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 from scipy import sparse
 
+from ...models.inputs.display import shown_briefly
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import occupancy, reachable_states, require_discounted, reward_of, soft_plan
 from ...models.process.units import feature_scale, with_scaled_features
@@ -46,6 +47,7 @@ _STAGES = (1e-2, 1e-5, _PROXIMAL)
 _HELD = 1e-7
 
 
+@shown_briefly
 class IpoptPoint(NamedTuple):
     """A primal-dual point: variables ``[2K + S]``, multipliers of their bounds and of the constraints.
 
@@ -57,6 +59,7 @@ class IpoptPoint(NamedTuple):
     constraint_multipliers: Float[np.ndarray, " S"]
 
 
+@shown_briefly
 class DualSolution(NamedTuple):
     """Solution of a program by IPOPT.
 

@@ -27,6 +27,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from scipy import optimize
 
+from ...models.inputs.display import shown_briefly
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import finite_hard_plan, finite_occupancy, finite_soft_plan, reward_of
 from ...models.process.units import feature_scale, with_scaled_features
@@ -44,6 +45,7 @@ class UnmatchedError(RuntimeError):
     """No weights were found whose policy collects what was asked for; says which feature stands out."""
 
 
+@shown_briefly
 class CausalEntropyFit(NamedTuple):
     """A reward whose soft policy matches the expert.
 

@@ -29,6 +29,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from ...models.inputs.display import shown_briefly
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import (
     feature_expectations,
@@ -55,6 +56,7 @@ _LARGEST_DAMPING = 1e4
 _MAX_REWARD_CHANGE = 50.0
 
 
+@shown_briefly
 class WarmStart(NamedTuple):
     """Where to begin: ``weights [K]``, and ``values [S]`` close to their soft values."""
 
@@ -62,6 +64,7 @@ class WarmStart(NamedTuple):
     values: Float[Array, " S"]
 
 
+@shown_briefly
 class Solution(NamedTuple):
     """Solution of a program by the JAX solvers.
 
@@ -216,6 +219,7 @@ def soft_values(
 # -- the objective, its derivatives -------------------------------------------------------------------
 
 
+@shown_briefly
 class LinearObjective(NamedTuple):
     """``g(theta) = state_weights . V_theta - features . theta``; both programs have this shape.
 

@@ -31,6 +31,7 @@ from numpy.typing import ArrayLike
 from scipy import sparse
 from scipy.special import logsumexp, xlogy
 
+from ...models.inputs.display import shown_briefly
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted
 from ...models.process.units import feature_scale, with_scaled_features
@@ -63,6 +64,7 @@ _WARM: dict[str, Any] = {
 }
 
 
+@shown_briefly
 class MinMaxPoint(NamedTuple):
     """A primal-dual point; what does not concern single trajectories starts the next session.
 
@@ -88,6 +90,7 @@ class MinMaxPoint(NamedTuple):
     sum_multiplier: float
 
 
+@shown_briefly
 class MinMaxSolution(NamedTuple):
     """A local maximum of the min-max-entropy program.
 

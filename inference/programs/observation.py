@@ -26,6 +26,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 from scipy.sparse import csgraph
 
+from ...models.inputs.display import shown_briefly
 from ...models.observation.agreement import PredicateClasses, agreement_patterns, predicate_classes
 from .constraints import ProgramNotSolved
 from .dual import COLD_OPTIONS, WARM_OPTIONS, IpoptPoint
@@ -36,6 +37,7 @@ _FLAT = 1e-10
 _LEAST_EXPONENT = 700.0
 
 
+@shown_briefly
 class Identification(NamedTuple):
     """Which reliabilities reports can tell, whatever they are.
 
@@ -183,6 +185,7 @@ def _moments(
     return mean, covariance
 
 
+@shown_briefly
 class ObservationSolution(NamedTuple):
     """Solution of the observation program.
 

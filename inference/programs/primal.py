@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from ...models.inputs.display import shown_briefly
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import reachable_states, require_discounted
 from ...models.process.units import feature_scale, with_scaled_features
@@ -35,6 +36,7 @@ _SETTINGS: dict[str, dict[str, object]] = {
 _SOLVED = {"CLARABEL": (cp.OPTIMAL, cp.OPTIMAL_INACCURATE), "SCS": (cp.OPTIMAL,)}
 
 
+@shown_briefly
 class PrimalSolution(NamedTuple):
     """Solution of the primal program.
 

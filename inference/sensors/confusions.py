@@ -7,6 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import SEEN, UNKNOWN, Demonstration
 from ...models.observation.evidence import ObservationModel
 
@@ -33,6 +34,7 @@ class ConfusionNoise(Protocol):
         """Itself with other ``chances``."""
 
 
+@shown_briefly
 class ConfusionStatistic(NamedTuple):
     """Expected numbers ``[M]``: how often each confusion happened, and how often it could have."""
 
@@ -47,7 +49,7 @@ def confusion_counts(
 
     Steps that were seen in part, or not at all, say nothing.
     """
-    kind, state, action = (jnp.asarray(x) for x in demonstration[:3])
+    kind, state, action = (jnp.asarray(x) for x in demonstration.arrays[:3])
     seen = (kind == SEEN) & (state != UNKNOWN) & (action != UNKNOWN)
     _, n_states, n_actions = noise.acts.shape
     size = n_states * n_actions

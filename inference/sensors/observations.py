@@ -21,6 +21,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from ...models.inputs.display import shown_briefly
 from ...models.observation.agreement import agreement_patterns
 from ...models.observation.demonstration import HIDDEN, SEEN, UNKNOWN, Demonstration
 from ...models.observation.evidence import FeatureNoise
@@ -37,6 +38,7 @@ _MAX_HALVINGS = 20
 _MAX_SWEEPS = 50
 
 
+@shown_briefly
 class ReportClasses(NamedTuple):
     """Pairs gathered by their predicates and by whether they can be reported.
 
@@ -106,6 +108,7 @@ def report_classes(predicates: ArrayLike, reportable: ArrayLike | None = None) -
     )
 
 
+@shown_briefly
 class SessionReports(NamedTuple):
     """A session's reports, prepared for any reliabilities.
 
@@ -145,7 +148,7 @@ def session_reports(
     classes: ReportClasses, demonstration: Demonstration, scored: bool = True
 ) -> SessionReports:
     """Prepare a demonstration; with ``scored`` false its scores are left aside."""
-    kind, state, action, score = (jnp.asarray(x) for x in demonstration)
+    kind, state, action, score = (jnp.asarray(x) for x in demonstration.arrays)
     n_states, n_actions = classes.of_pair.shape
     states = (state[..., None] == UNKNOWN) | (state[..., None] == jnp.arange(n_states))
     actions = (action[..., None] == UNKNOWN) | (action[..., None] == jnp.arange(n_actions))
@@ -280,6 +283,7 @@ def report_log_evidence(
 # -- the statistic ------------------------------------------------------------------------------------
 
 
+@shown_briefly
 class ReportStatistic(NamedTuple):
     """All that is kept of reports: running averages over them.
 
@@ -372,6 +376,7 @@ def report_statistic(
 # -- the program --------------------------------------------------------------------------------------
 
 
+@shown_briefly
 class SensorFit(NamedTuple):
     """Reliabilities that explain the statistic.
 

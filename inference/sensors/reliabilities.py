@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import PAD, SEEN, Demonstration
 from ...models.process.mdp import TabularMDP
 from ..programs.dual import IpoptPoint
@@ -38,6 +39,7 @@ _CODED_COUNT = 1e-4
 _SURE = 1e-6
 
 
+@shown_briefly
 class WithTruth(NamedTuple):
     """A noisy demonstration and what really happened, for the ``oracle`` only; arrays of one shape."""
 
@@ -59,6 +61,7 @@ class WithTruth(NamedTuple):
         return WithTruth(self.seen.bucketed(), self.truth.bucketed())
 
 
+@shown_briefly
 class PreparedSession(NamedTuple):
     """A session's demonstration in the form that passes over it need.
 
@@ -95,6 +98,7 @@ def prepare(
     return PreparedSession(session_reports(classes, seen, scored), jnp.asarray(seen.kind) != PAD, truth)
 
 
+@shown_briefly
 class Perception(NamedTuple):
     """How reliabilities are learned.
 
@@ -196,6 +200,7 @@ def entropic_perception(
 # -- controls -----------------------------------------------------------------------------------------
 
 
+@shown_briefly
 class FrequencyStatistic(NamedTuple):
     """Reliabilities by counting.
 

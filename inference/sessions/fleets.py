@@ -13,10 +13,12 @@ from jax import lax
 from jaxtyping import Array
 
 from ...models.inputs.arguments import as_key
+from ...models.inputs.display import shown_briefly
 from ...models.observation.demonstration import Demonstration
 from .learner import Learner, SessionInfo
 
 
+@shown_briefly
 class Fleet(NamedTuple):
     """One learner on many independent streams: states and demonstrations with a leading axis."""
 

@@ -17,12 +17,14 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float
 
+from ...models.inputs.display import brief, brief_table, joined, shown_briefly
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
 
 AnyInfo = TypeVar("AnyInfo", bound=tuple)
 
 
+@shown_briefly
 class SessionInfo(NamedTuple):
     """What a session did: plain numbers (from a fleet, arrays with one entry a stream).
 
@@ -89,6 +91,20 @@ class Learner(NamedTuple):
     update: Callable[[Any, Demonstration], tuple[Any, SessionInfo]]
     session: Callable[[Any, Demonstration], tuple[Any, SessionInfo]] | None = None
     log_likelihood: Callable[[Any, Float[Array, " K"]], float] | None = None
+
+    def __repr__(self) -> str:
+        return joined(
+            type(self).__name__,
+            [brief(self.name), repr(self.mdp), *(f"{name}={value}" for name, value in self._settings())],
+        )
+
+    def _repr_html_(self) -> str:
+        rows = [("mdp", repr(self.mdp)), *self._settings()]
+        return brief_table(f"{type(self).__name__} {brief(self.name)}", rows)
+
+    def _settings(self) -> list[tuple[str, str]]:
+        known = self.configuration if isinstance(self.configuration, Mapping) else {}
+        return [(brief(str(name)).strip("'"), brief(value)) for name, value in known.items()]
 
     @property
     def signature(self) -> str:

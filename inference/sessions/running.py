@@ -9,6 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Array, Float
 
+from ...models.inputs.display import brief, brief_table, counted, joined
 from ...models.inputs.text import shortened
 from ...models.observation.demonstration import Demonstration
 from .learner import Learner, SessionInfo
@@ -49,6 +50,29 @@ class Run(NamedTuple):
     state: Any
     infos: tuple[SessionInfo, ...]
     stopped: bool
+
+    def __repr__(self) -> str:
+        (_, sessions), (_, ended), *last, (_, state) = self._rows()
+        shown = [
+            counted(int(sessions), "session"),
+            ended,
+            *(f"{name} {value}" for name, value in last),
+            state,
+        ]
+        return joined(type(self).__name__, shown)
+
+    def _repr_html_(self) -> str:
+        return brief_table(type(self).__name__, self._rows())
+
+    def _rows(self) -> list[tuple[str, str]]:
+        infos = self.infos if isinstance(self.infos, tuple) else ()
+        last = [
+            (f"last {name.replace('_', ' ')}", brief(getattr(infos[-1], name)))
+            for name in ("log_likelihood", "weights")
+            if infos and hasattr(infos[-1], name)
+        ]
+        ended = "stopped by the criterion" if self.stopped is True else "the stream ended"
+        return [("sessions", str(len(infos))), ("end", ended), *last, ("state", brief(self.state))]
 
 
 def run_sessions(
@@ -122,7 +146,7 @@ def run_sessions(
 
 
 def _require_stream(stream: Any) -> None:
-    if isinstance(stream, tuple) and hasattr(stream, "_fields"):
+    if isinstance(stream, Demonstration) or (isinstance(stream, tuple) and hasattr(stream, "_fields")):
         name = type(stream).__name__
         several = f", {name}.sessions() for one a trajectory" if hasattr(stream, "sessions") else ""
         advice = f"pass [it] for one session{several}"

@@ -137,7 +137,7 @@ def demonstration_digest(demonstration: Any) -> bytes:
 
 
 def _trimmed(demonstration: Demonstration) -> Demonstration:
-    kind, state, action, score = (np.asarray(x) for x in demonstration)
+    kind, state, action, score = (np.asarray(x) for x in demonstration.arrays)
     live = kind != PAD
     rows, width = live.any(1), int(live.any(0).nonzero()[0].max(initial=-1)) + 1
     arrays = (kind.astype(np.int8), state.astype(np.int32), action.astype(np.int32), score.astype(float))

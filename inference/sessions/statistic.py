@@ -23,12 +23,14 @@ from typing import Any, NamedTuple, Protocol
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from ...models.inputs.display import shown_briefly
 from ...models.laws.chain import Smoothed
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import SoftPlan, action_values, features_to_go, reward_of
 from ..completion.smoothing import Expectations, collect
 
 
+@shown_briefly
 class FeatureStatistic(NamedTuple):
     """``(n, phi_hat, start)``: trajectories, mean discounted features ``[K]``, start distribution ``[S]``."""
 
@@ -37,6 +39,7 @@ class FeatureStatistic(NamedTuple):
     start: Float[Array, " S"]
 
 
+@shown_briefly
 class CountStatistic(NamedTuple):
     """``(n, N)``: trajectories, and mean expected visits per trajectory ``[S, A]``."""
 
@@ -44,6 +47,7 @@ class CountStatistic(NamedTuple):
     counts: Float[Array, "S A"]
 
 
+@shown_briefly
 class Completed(NamedTuple):
     """One session's demonstration completed under the current policy."""
 

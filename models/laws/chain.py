@@ -24,6 +24,7 @@ import jax.numpy as jnp
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
+from ..inputs.display import shown_briefly
 from ..process.mdp import TabularMDP
 
 Passed = TypeVar("Passed", bound=tuple)
@@ -38,6 +39,7 @@ _DISAPPOINTED = 250.0
 _TINY = 1e-300
 
 
+@shown_briefly
 class Filtered(NamedTuple):
     """Forward pass over one trajectory.
 
@@ -51,6 +53,7 @@ class Filtered(NamedTuple):
     final: Float[Array, " S"]
 
 
+@shown_briefly
 class Smoothed(NamedTuple):
     """Forward-backward pass over one trajectory.
 
@@ -63,6 +66,7 @@ class Smoothed(NamedTuple):
     final: Float[Array, " S"]
 
 
+@shown_briefly
 class SmoothedTransitions(NamedTuple):
     """Forward-backward pass that keeps transitions, ``P(s_t, a_t, s_{t+1} | all evidence)``.
 

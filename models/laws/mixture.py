@@ -20,6 +20,7 @@ from numpyro.distributions import constraints
 from numpyro.distributions.util import validate_sample
 
 from ..inputs.arguments import as_key
+from ..inputs.display import shown_briefly
 from ..observation.demonstration import PAD, SEEN, UNKNOWN
 from ..observation.evidence import (
     AnySensor,
@@ -38,6 +39,7 @@ from .trajectory import CodesConstraint
 COMPONENTS = 10
 
 
+@shown_briefly
 class Perceived(NamedTuple):
     """Trajectories prepared for many evaluations of a mixture: what no weights change is computed once.
 

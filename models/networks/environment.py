@@ -13,9 +13,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from ..inputs.display import shown_briefly
 from .modules import ActionSpace
 
 
+@shown_briefly
 class Environment(NamedTuple):
     """A task as pure functions of one state; ``jax.vmap`` makes them functions of many.
 
@@ -86,6 +88,7 @@ class HostEnvironment(Protocol):
         ...
 
 
+@shown_briefly
 class Rollout(NamedTuple):
     """``T`` steps of ``n`` episodes side by side, new ones beginning where old ones end.
 

@@ -16,6 +16,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from ...extras import required
+from ..inputs.display import shown_briefly
 
 if TYPE_CHECKING:
     import equinox as eqx
@@ -25,6 +26,7 @@ else:
 DTYPE = jnp.float32
 
 
+@shown_briefly
 class ActionSpace(NamedTuple):
     """Actions of a task: ``n`` of them, or vectors between ``low [k]`` and ``high [k]`` (then ``n`` is 0)."""
 

@@ -8,9 +8,11 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from ..inputs.display import shown_briefly
 from .evidence import FeatureNoise, checked_predicates
 
 
+@shown_briefly
 class PredicateClasses(NamedTuple):
     """Pairs that no predicate tells apart, gathered: the program's cost is in classes, not in pairs.
 
@@ -84,6 +86,7 @@ def agreement_patterns(
     return rows[first].astype(float), which.reshape(agreements.shape[:-1])
 
 
+@shown_briefly
 class ReportedMatches(NamedTuple):
     """What a posterior over truths says of the reports of a session.
 

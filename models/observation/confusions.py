@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from ..inputs.arguments import concrete, is_traced, rebuilt_unchecked
+from ..inputs.display import shown_briefly
 from .evidence import AnySensor, ObservationModel, Sensor
 
 
@@ -17,6 +18,7 @@ class _ConfusionFields(NamedTuple):
     chances: Float[Array, " M"]
 
 
+@shown_briefly
 @rebuilt_unchecked
 class Confusions(_ConfusionFields):
     """A pair is reported as another with the probability of the one confusion that acts on it.

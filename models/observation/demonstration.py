@@ -10,13 +10,27 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import partial
+from operator import itemgetter
 from pathlib import PurePath
 from typing import IO, Any, NamedTuple, NoReturn
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from ..inputs.display import (
+    brief_repr,
+    brief_table,
+    counted,
+    fields_of,
+    joined,
+    readable,
+    shown_briefly,
+    told_steps,
+)
 from ..inputs.text import JSONError, JSONSyntaxError, listed, parsed_json, shortened
 from ..process.mdp import TabularMDP
 
@@ -31,11 +45,20 @@ class DemonstrationError(ValueError):
     """A demonstration that cannot be read or that the model rules out; names the record at fault."""
 
 
-class Demonstration(NamedTuple):
+@partial(
+    jax.tree_util.register_dataclass,
+    data_fields=["kind", "state", "action", "score"],
+    meta_fields=[],
+)
+@dataclass(frozen=True, eq=False, repr=False)
+class Demonstration:
     """``n`` trajectories padded to ``L`` steps.
 
-    Fields
-    ------
+    A container of trajectories: ``len``, iteration, and indexing by a number, a slice, a mask or numbers give
+    demonstrations of some of them. Immutable, and a JAX pytree of its four arrays; compared by identity.
+
+    Attributes
+    ----------
     kind : int8 ``[n, L]``
         ``SEEN``; ``HIDDEN`` (the learner looked and saw nothing, which is itself evidence); ``LOST`` (no
         frame, no evidence); ``PAD`` beyond the trajectory's end.
@@ -50,10 +73,65 @@ class Demonstration(NamedTuple):
     action: Int[np.ndarray, "n L"]
     score: Float[np.ndarray, "n L"]
 
+    def __len__(self) -> int:
+        """Count the trajectories, padding rows included."""
+        return self.kind.shape[0]
+
+    def __iter__(self) -> Iterator[Demonstration]:
+        """Iterate over the trajectories, each a demonstration of one."""
+        return (self[i] for i in range(len(self)))
+
+    def __getitem__(self, rows: Any) -> Demonstration:
+        """Select trajectories by a number, a slice, a mask ``[n]`` or numbers; always a demonstration.
+
+        Raises ``IndexError`` for a trajectory that does not exist or a mask of another length, ``TypeError``
+        for what selects nothing.
+
+        Examples
+        --------
+        >>> demo = Demonstration.from_pairs([[0, 1], [2, 0], [1, 1]], [[1, 1], [0, 0], [1, 0]])
+        >>> len(demo), demo[-1].state.tolist(), demo[[True, False, True]].state.tolist()
+        (3, [[1, 1]], [[0, 1], [1, 1]])
+        """
+        chosen = _rows(rows, len(self))
+        return self._map(lambda array: array[chosen])
+
+    def __array__(self, *_: Any, **__: Any) -> NoReturn:
+        """Refuse to become one array."""
+        raise TypeError("a Demonstration is no array; its attribute `codes` is one")
+
+    def __repr__(self) -> str:
+        rows = self._told()
+        if rows is None:
+            return brief_repr(self)
+        (_, n), (_, steps), *counts = rows
+        return joined(type(self).__name__, [n, steps, *(f"{count} {name}" for name, count in counts)])
+
+    def _repr_html_(self) -> str:
+        rows = self._told()
+        return brief_table(type(self).__name__, fields_of(self) if rows is None else rows)
+
+    def _told(self) -> list[tuple[str, str]] | None:
+        """What it holds, in words; None where JAX put something else into the fields."""
+        if not readable(self.kind) or np.ndim(self.kind) != 2:
+            return None
+        kind = np.asarray(self.kind)
+        n, steps = counted(len(kind), "trajectory", "trajectories"), told_steps(self.lengths)
+        kinds = (("seen", SEEN), ("hidden", HIDDEN), ("lost", LOST))
+        return [("trajectories", n), ("steps", steps), *((name, str((kind == k).sum())) for name, k in kinds)]
+
+    def _map(self, change: Callable[[np.ndarray], np.ndarray]) -> Demonstration:
+        return Demonstration(*(change(np.asarray(x)) for x in self.arrays))
+
+    @property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Kind, state, action and score, each ``[n, L]``."""
+        return self.kind, self.state, self.action, self.score
+
     @property
     def n_trajectories(self) -> int:
         """Number of trajectories, padding rows included."""
-        return self.kind.shape[0]
+        return len(self)
 
     @property
     def lengths(self) -> Int[np.ndarray, " n"]:
@@ -154,7 +232,7 @@ class Demonstration(NamedTuple):
 
     def select(self, rows: slice | np.ndarray | list[int]) -> Demonstration:
         """Some of the trajectories."""
-        return Demonstration(*(np.asarray(x)[rows] for x in self))
+        return self[rows]
 
     def padded(self, n_trajectories: int, length: int) -> Demonstration:
         """The same demonstration in a larger array, so that one compiled program serves many sizes."""
@@ -166,7 +244,10 @@ class Demonstration(NamedTuple):
         grow = ((0, n_trajectories - n), (0, length - width))
         fills = (PAD, UNKNOWN, UNKNOWN, np.nan)
         return Demonstration(
-            *(np.pad(np.asarray(x), grow, constant_values=fill) for x, fill in zip(self, fills, strict=True))
+            *(
+                np.pad(np.asarray(x), grow, constant_values=fill)
+                for x, fill in zip(self.arrays, fills, strict=True)
+            )
         )
 
     def bucketed(self) -> Demonstration:
@@ -186,7 +267,7 @@ class Demonstration(NamedTuple):
         if length < 1:
             raise ValueError(f"a fragment needs at least one step, got {length}")
         parts = [
-            Demonstration(*(np.asarray(x)[i : i + 1, start : start + length] for x in self))
+            self._map(itemgetter((slice(i, i + 1), slice(start, start + length))))
             for i, total in enumerate(self.lengths)
             for start in range(0, int(total), length)
         ]
@@ -199,7 +280,33 @@ def concatenate(demonstrations: Sequence[Demonstration]) -> Demonstration:
         raise ValueError("nothing to concatenate")
     width = max(d.kind.shape[1] for d in demonstrations)
     grown = [d.padded(d.n_trajectories, width) for d in demonstrations]
-    return Demonstration(*(np.concatenate(parts) for parts in zip(*grown, strict=True)))
+    return Demonstration(*(np.concatenate(parts) for parts in zip(*(d.arrays for d in grown), strict=True)))
+
+
+def _rows(given: Any, n: int) -> Any:
+    """What selects trajectories, as an index that keeps their axis."""
+    if isinstance(given, slice):
+        return given
+    try:
+        rows = np.asarray(given)
+    except ValueError:  # lists of different lengths
+        rows = np.zeros(0, "U1")
+    if not rows.size and rows.dtype.kind == "f":  # an empty list
+        rows = rows.astype(int)
+    if rows.dtype.kind not in "biu" or rows.ndim > 1 or (rows.dtype.kind == "b" and rows.ndim == 0):
+        raise TypeError(
+            f"trajectories must be selected by a number, a slice, a mask [n] or numbers; "
+            f"got {shortened(given)}"
+        )
+    if rows.dtype.kind == "b":
+        if len(rows) != n:
+            raise IndexError(f"a mask of {n} trajectories has as many entries; got {len(rows)}")
+        return rows
+    rows = np.atleast_1d(rows)
+    beyond = rows[(rows < -n) | (rows >= n)]
+    if beyond.size:
+        raise IndexError(f"trajectories must lie in 0 to {n - 1}; got {beyond[0]}")
+    return rows
 
 
 def _power_of_two(n: int) -> int:
@@ -210,7 +317,7 @@ def _stack(rows: list[list[tuple[int, int, int, float]]]) -> Demonstration:
     width = max((len(row) for row in rows), default=0)
     demo = _padding((len(rows), max(width, 1)))
     for i, row in enumerate(rows):
-        for array, values in zip(demo, zip(*row, strict=True), strict=False):
+        for array, values in zip(demo.arrays, zip(*row, strict=True), strict=False):
             array[i, : len(row)] = values
     return demo
 
@@ -469,6 +576,7 @@ class LineLimits(NamedTuple):
 DEFAULT_LIMITS = LineLimits()
 
 
+@shown_briefly
 class Record(NamedTuple):
     """One line of a file: its number, its ``id`` and ``agent`` (None if absent), and the trajectory."""
 
@@ -624,7 +732,7 @@ def write_trajectories(
     names = _Names(mdp)
     n = demonstration.n_trajectories
     extra = {"id": _per_row("ids", ids, n, text=True), "agent": _per_row("agents", agents, n, text=False)}
-    arrays = [np.asarray(x) for x in demonstration]
+    arrays = [np.asarray(x) for x in demonstration.arrays]
     for i, total in enumerate(demonstration.lengths):
         if not total:
             continue

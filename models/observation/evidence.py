@@ -18,6 +18,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from ..inputs.arguments import as_key, concrete, described, is_traced, rebuilt_unchecked
+from ..inputs.display import shown_briefly
 from ..inputs.probabilities import normalised, sum_tolerance
 from ..process.mdp import PairNames, TabularMDP
 from .demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration, DemonstrationError
@@ -59,6 +60,7 @@ class _SensorFields(NamedTuple):
     noise: ObservationModel | None = None
 
 
+@shown_briefly
 @rebuilt_unchecked
 class Sensor(_Composable, _SensorFields):  # type: ignore[misc]
     """A product of imperfections; ``Sensor()`` sees everything exactly.
@@ -98,7 +100,7 @@ def as_sensor(given: Any) -> AnySensor:
     Examples
     --------
     >>> as_sensor([True, False, True])
-    Visibility(in_view=Array([1., 0., 1.], dtype=float64))
+    Visibility(in_view=[1, 0, 1])
     """
     if _is_sensor(given):
         return given
@@ -130,6 +132,7 @@ class _VisibilityFields(NamedTuple):
     in_view: Float[Array, " S"]
 
 
+@shown_briefly
 @rebuilt_unchecked
 class Visibility(_Composable, _VisibilityFields):  # type: ignore[misc]
     """A view that covers some states: ``in_view[s]`` is the probability of seeing a step in ``s``.
@@ -158,6 +161,7 @@ class _ObservationFields(NamedTuple):
     log_probabilities: Float[Array, "S A S A"]
 
 
+@shown_briefly
 @rebuilt_unchecked
 class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
     """A full confusion of pairs: ``log O(o_s, o_a | s, a)`` as ``[S, A, S, A]``, truth first.
@@ -265,6 +269,7 @@ class _NoiseFields(NamedTuple):
     reportable: Bool[Array, "S A"]
 
 
+@shown_briefly
 @rebuilt_unchecked
 class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
     """Noise on features of a pair (6.1): ``O(o | g)`` by the predicates that ``o`` and ``g`` agree on.
@@ -443,10 +448,10 @@ def checked_demonstration(
             "demonstration must be a Demonstration, such as Demonstration.from_pairs(states, actions) or "
             f"Demonstration.from_steps(trajectories, mdp) makes; got {described(demonstration)}"
         )
-    if any(is_traced(x) for x in demonstration):
+    if any(is_traced(x) for x in demonstration.arrays):
         return demonstration
-    checked = Demonstration(*(np.asarray(x) for x in demonstration))
-    _check_codes(mdp, *checked[:3], record)
+    checked = Demonstration(*(np.asarray(x) for x in demonstration.arrays))
+    _check_codes(mdp, *checked.arrays[:3], record)
     score = checked.score
     if score.shape != checked.kind.shape:
         raise DemonstrationError(
@@ -546,7 +551,7 @@ def log_evidence(sensor: AnySensor, mdp: TabularMDP, demonstration: Demonstratio
     """
     sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
     step = jax.vmap(jax.vmap(lambda *x: step_log_evidence(sensor, mdp.n_states, mdp.n_actions, *x)))
-    kind, state, action, score = (jnp.asarray(x) for x in demonstration)
+    kind, state, action, score = (jnp.asarray(x) for x in demonstration.arrays)
     return step(kind, state, action, score)
 
 
@@ -592,7 +597,8 @@ def require_possible(
     visibility = np.ones(mdp.n_states) if sensor.visibility is None else np.asarray(sensor.visibility)
     for i in range(demonstration.n_trajectories):
         states = start
-        for t, (kind, s, a, score) in enumerate(zip(*(np.asarray(x)[i] for x in demonstration), strict=True)):
+        columns = (np.asarray(x)[i] for x in demonstration.arrays)
+        for t, (kind, s, a, score) in enumerate(zip(*columns, strict=True)):
             if kind == PAD:
                 break
             if kind == SEEN and sensor.noise is None:

@@ -16,6 +16,16 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from ..inputs.arguments import as_key, concrete, described, rebuilt_unchecked
+from ..inputs.display import (
+    brief_repr,
+    brief_table,
+    counted,
+    fields_of,
+    joined,
+    readable,
+    shown_briefly,
+    told_steps,
+)
 
 MOUNTAIN_CAR_SHIFT = 0.1 * 1.8 / 10
 """A tenth of a tenth of mountain car's range of positions, 1.8 (section 7.4.3)."""
@@ -44,6 +54,30 @@ class Recording(NamedTuple):
     actions: Array
     live: Bool[Array, "n L"]
     terminated: Bool[Array, " n"]
+
+    def __repr__(self) -> str:
+        rows = self._rows()
+        return brief_repr(self) if rows is None else joined(type(self).__name__, [told for _, told in rows])
+
+    def _repr_html_(self) -> str:
+        rows = self._rows()
+        return brief_table(type(self).__name__, fields_of(self) if rows is None else rows)
+
+    def _rows(self) -> list[tuple[str, str]] | None:
+        """What it holds, in words; None where JAX put something else into the fields."""
+        if not (readable(self.live) and readable(self.terminated)) or np.ndim(self.live) != 2:
+            return None
+        parts = [
+            (name, f"{name} {x.dtype}[{', '.join(map(str, x.shape[2:]))}]")
+            for name, x in (("observations", self.observations), ("actions", self.actions))
+            if hasattr(x, "shape") and hasattr(x, "dtype")
+        ]
+        return [
+            ("trajectories", counted(len(self.live), "trajectory", "trajectories")),
+            ("steps", told_steps(self.lengths)),
+            *parts,
+            ("terminated", f"{int(np.sum(np.asarray(self.terminated)))} terminated"),
+        ]
 
     @property
     def lengths(self) -> np.ndarray:
@@ -242,6 +276,7 @@ class _GaussianFields(NamedTuple):
     action_covariance: Float[Array, "*a"]
 
 
+@shown_briefly
 @rebuilt_unchecked
 class GaussianSensor(_GaussianFields):
     """Reports normal about the truth, states and actions independently (section 6.2.3, Technique 2).
@@ -362,6 +397,7 @@ class _ShiftFields(NamedTuple):
     probability: float | Array
 
 
+@shown_briefly
 @rebuilt_unchecked
 class ShiftSensor(_ShiftFields):
     """Mountain car's noise: the position is now and then reported further along in the action's direction.
@@ -447,6 +483,7 @@ class FiniteSensor(Protocol):
         """The truths, and the log-probability that each would be reported so."""
 
 
+@shown_briefly
 class Truths(NamedTuple):
     """Draws of what may have happened behind a recording, ``M`` of them, usable as an expert's transitions.
 

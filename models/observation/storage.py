@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..inputs.archives import MAX_BYTES, StorageError, read_arrays
+from ..inputs.display import shown_briefly
 from ..inputs.text import shortened
 from ..process.mdp import TabularMDP
 from .evidence import Visibility
@@ -21,6 +22,7 @@ _KINDS = {
 }  # fmt: skip
 
 
+@shown_briefly
 class StoredMDP(NamedTuple):
     """An MDP read from a file, and the learner's view ``[S]`` if the file has one."""
 

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from scipy import sparse
 
+from ..inputs.display import brief, brief_repr, brief_table, fields_of
 from ..inputs.probabilities import normalised, sum_tolerance
 from ..inputs.text import listed, shortened
 
@@ -271,6 +272,32 @@ class TabularMDP:
     def feature_names(self) -> tuple[str, ...]:
         """Names of the features, given or ``f0, f1, ...``."""
         return self.labels.features or tuple(f"f{i}" for i in range(self.n_features))
+
+    def __repr__(self) -> str:
+        sizes = self._sizes()
+        if sizes is None:
+            return brief_repr(self)
+        told = ", ".join(f"{n} {name}" for name, n in sizes.items())
+        return f"{type(self).__name__}({told}, discount {brief(self.discount)})"
+
+    def _repr_html_(self) -> str:
+        sizes = self._sizes()
+        if sizes is None:
+            return brief_table(type(self).__name__, fields_of(self))
+        given = (self.labels.states, self.labels.actions, self.labels.features)
+        rows = [
+            (name, f"{n}: {listed(names, 8)}" if names else str(n))
+            for (name, n), names in zip(sizes.items(), given, strict=True)
+        ]
+        return brief_table(type(self).__name__, [*rows, ("discount", self.discount)])
+
+    def _sizes(self) -> dict[str, int] | None:
+        """Numbers of states, actions and features; None where JAX put something else into the fields."""
+        try:
+            sizes = {"states": self.n_states, "actions": self.n_actions, "features": self.n_features}
+        except (AttributeError, IndexError, TypeError):
+            return None
+        return sizes if all(isinstance(n, int) for n in sizes.values()) else None
 
     def fingerprint(self) -> str:
         """Digest everything that defines this MDP, in hexadecimal; equal exactly for equal MDPs.

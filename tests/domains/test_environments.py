@@ -9,8 +9,7 @@ from scipy import stats
 from i2rl.domains import instance, mouse_labyrinth, sorting_with_claiming
 from i2rl.domains.environments import ENVIRONMENTS, TabularEnv
 from i2rl.domains.gym.canvas import Frame
-from i2rl.domains.labyrinth.picture import maze_layout
-from i2rl.domains.labyrinth.process import HOME, N_NODES, parent_of
+from i2rl.domains.labyrinth.process import HOME, N_NODES, maze_positions, parent_of
 
 IDS = tuple(ENVIRONMENTS)
 TABULAR = tuple(name for name in IDS if "Breach" not in name)
@@ -227,7 +226,7 @@ def test_a_process_nobody_drew_is_shown_in_words(random_mdp):
 
 
 def test_the_maze_is_drawn_as_it_is_walked():
-    places = maze_layout()
+    places = maze_positions()
     assert len({tuple(place) for place in places}) == N_NODES + 1
     for node in range(1, N_NODES):
         parent = parent_of(node)

@@ -22,6 +22,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -107,7 +108,7 @@ def random_stream(size: int, predicates: int, sessions: int, *, named: bool = Fa
     anything = np.argwhere(np.asarray(mdp.available))[rng.integers(0, int(mdp.available.sum()), astray.shape)]
     state, action = (np.where(astray, anything[..., i], pairs[i]) for i in (0, 1))
     seen = Demonstration.from_pairs(state, action)
-    return Stream(mdp, psi, seen._replace(score=np.full(state.shape, 1 - ASTRAY)), 2)
+    return Stream(mdp, psi, replace(seen, score=np.full(state.shape, 1 - ASTRAY)), 2)
 
 
 def interleaved_seconds(

@@ -73,9 +73,7 @@ def view_streams(patrol: Patrol, view: int, runs: int, sessions: int, seed: int 
     """Windows of both patrollers of each run, ``[runs * patrollers, sessions, 1, WINDOW]``."""
     keys = jax.random.split(jax.random.key(seed), runs)
     rows = [d for key in keys for d in demonstrate(key, patrol, view, sessions, WINDOW)]
-    return Demonstration(
-        *(np.stack([np.asarray(x)[:, None] for x in parts]) for parts in zip(*rows, strict=True))
-    )
+    return jax.tree.map(lambda *parts: np.stack(parts)[:, :, None], *rows)
 
 
 # -- studies ------------------------------------------------------------------------------------------
@@ -162,7 +160,7 @@ def noise_study(
         streams = streams_of(level)
         make, seen = noise_methods(streams, patrol)[name]
         learner = make(forgetting=forgetting, iterations=iterations)
-        own = Demonstration(*(x[:count] for x in seen))
+        own = Demonstration(*(x[:count] for x in seen.arrays))
 
         def action(
             name: str = name,

@@ -18,6 +18,7 @@ from __future__ import annotations
 import argparse
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -143,7 +144,8 @@ def hide(key: jax.Array, demonstration: Demonstration, share: float) -> Demonstr
     """Hide each step with this probability."""
     kind = np.array(demonstration.kind)
     hidden = np.asarray(jax.random.uniform(key, kind.shape)) < share
-    return demonstration._replace(
+    return replace(
+        demonstration,
         kind=np.where(hidden, HIDDEN, kind),
         state=np.where(hidden, UNKNOWN, demonstration.state),
         action=np.where(hidden, UNKNOWN, demonstration.action),

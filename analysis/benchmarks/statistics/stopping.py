@@ -34,7 +34,6 @@ from jaxtyping import Float
 from ....domains.patrol.process import Patrol, demonstrate, instance
 from ....inference.learners.lme import lme_i2rl
 from ....inference.sessions.fleets import run_streams
-from ....models.observation.demonstration import Demonstration
 from ....models.process.planning import deterministic_policy, hard_plan, reward_of
 from ...bounds.stopping import (
     Histories,
@@ -62,7 +61,7 @@ def learn(patrol: Patrol, runs: int, sessions: int, seed: int) -> dict[str, np.n
     """Reports of all streams: log-likelihoods and gradients ``[R, T]``, weights ``[R, T, K]``."""
     key, start = jax.random.key(seed), jax.random.key(seed + 1)
     rows = [demonstrate(k, patrol, PERCENT, sessions, STEPS)[0] for k in jax.random.split(key, runs)]
-    streams = Demonstration(*(np.stack(parts)[:, :, None] for parts in zip(*rows, strict=True)))
+    streams = jax.tree.map(lambda *parts: np.stack(parts)[:, :, None], *rows)
     learner = lme_i2rl(patrol.mdp, patrol.visibility(PERCENT))
     _, reports = run_streams(learner, start, streams)
     names = ("log_likelihood", "gradient", "weights")

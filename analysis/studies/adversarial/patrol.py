@@ -90,7 +90,7 @@ def noisy_streams(patrol: Patrol, level: float, runs: int, sessions: int, seed: 
     there = np.broadcast_to((np.arange(MOST) < sizes[:, None])[..., None], (runs, sessions, MOST, STEPS))
 
     def shaped(demonstration: Demonstration) -> Demonstration:
-        arrays = (np.asarray(x).reshape(there.shape) for x in demonstration)
+        arrays = (np.asarray(x).reshape(there.shape) for x in demonstration.arrays)
         fills = (PAD, UNKNOWN, UNKNOWN, np.nan)
         return Demonstration(
             *(np.where(there, x, f).astype(x.dtype) for x, f in zip(arrays, fills, strict=True))
@@ -238,7 +238,7 @@ def patrol_results(
         given = streams.truth if name == CLEAN else streams.seen
         runs = []
         for seed in range(seeds):
-            runs.append(_run(patrol, learner, Demonstration(*(x[seed] for x in given)), seed))
+            runs.append(_run(patrol, learner, _at(given, seed), seed))
             share = (i + (seed + 1) / seeds) / len(learners)
             advance(f"{name}, seed {seed}: LBA {runs[-1].accuracy[-1]:.1%}", share)
         policies = np.array([greedy_policy_of(patrol.mdp, r.state) for r in runs])
@@ -281,11 +281,16 @@ def _run(patrol: Patrol, learner: Learner, sessions: Demonstration, seed: int) -
     state = learner.init(jax.random.key(seed))
     accuracy, seconds = [], []
     for session in range(len(sessions.kind)):
-        state, report = learner.update(state, Demonstration(*(x[session] for x in sessions)))
+        state, report = learner.update(state, _at(sessions, session))
         policy = greedy_policy_of(patrol.mdp, state)
         accuracy.append(float(policy_accuracy(patrol.mdp, optimal, policy).overall))
         seconds.append(report.seconds)
     return _Run(accuracy, seconds, state, np.asarray(report.noise))  # type: ignore[attr-defined]
+
+
+def _at(demonstrations: Demonstration, place: Any) -> Demonstration:
+    """The part of arrays with leading axes."""
+    return Demonstration(*(np.asarray(x)[place] for x in demonstrations.arrays))
 
 
 def believed_trajectories(results: AdversarialResults) -> Sequence[tuple[Strip, TabularMDP]]:
@@ -299,7 +304,7 @@ def believed_trajectories(results: AdversarialResults) -> Sequence[tuple[Strip, 
     if not wrong.any():
         return ()
     place = tuple(np.argwhere(wrong)[0])
-    seen, truth = (Demonstration(*(x[place][None] for x in d)) for d in (streams.seen, streams.truth))
+    seen, truth = (_at(d, (*place, None)) for d in (streams.seen, streams.truth))
     log_policy = jnp.log(jnp.asarray(results.settings[POLICY]))
     posterior = smooth_all(patrol.mdp, log_policy, evidence_of(patrol.mdp, streams.sensor, seen)).pairs
     return ((Strip(seen, truth, np.asarray(posterior)[0]), patrol.mdp),)

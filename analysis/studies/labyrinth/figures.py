@@ -12,7 +12,6 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.figure import Figure
 from matplotlib.patches import Rectangle
 
-from ....domains.labyrinth.picture import maze_layout
 from ....domains.labyrinth.process import (
     ACTIONS,
     BACK,
@@ -21,6 +20,7 @@ from ....domains.labyrinth.process import (
     N_NODES,
     WATER_PORT,
     Labyrinth,
+    maze_positions,
     parent_of,
 )
 from ....models.process.planning import action_values, reward_of
@@ -146,9 +146,9 @@ def draw_maze(
 ) -> None:
     """Draw corridors coloured by the value of the node they lead to (none: NaN); hidden ones are hatched.
 
-    The maze lies as its environment draws it (:func:`i2rl.domains.labyrinth.picture.maze_layout`).
+    The maze lies as its environment draws it (:func:`i2rl.domains.labyrinth.process.maze_positions`).
     """
-    position = maze_layout()
+    position = maze_positions()
 
     def corridor(node: int, width: float, colour: Any) -> None:
         start = position[HOME if node == 0 else parent_of(node)]

@@ -109,11 +109,11 @@ class Streams(NamedTuple):
 
     def session(self, run: int, session: int, of: str = "seen") -> Demonstration:
         """One session, counted from zero."""
-        return Demonstration(*(np.asarray(x)[run, session] for x in getattr(self, of)))
+        return Demonstration(*(np.asarray(x)[run, session] for x in getattr(self, of).arrays))
 
     def whole(self, run: int, of: str = "seen") -> Demonstration:
         """All trajectories of a run."""
-        arrays = getattr(self, of)
+        arrays = getattr(self, of).arrays
         return Demonstration(*(np.asarray(x)[run].reshape(-1, x.shape[-1]) for x in arrays))
 
 
@@ -138,7 +138,7 @@ def draw_streams(
     )  # fmt: skip
     shape = (runs, sessions, TRAJECTORIES, steps)
     seen, truth = (
-        Demonstration(*(np.asarray(x).reshape(shape) for x in d)) for d in (drawn.seen, drawn.truth)
+        Demonstration(*(np.asarray(x).reshape(shape) for x in d.arrays)) for d in (drawn.seen, drawn.truth)
     )
     return Streams(seen, truth, drawn.mdp)
 

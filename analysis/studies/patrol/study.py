@@ -13,7 +13,7 @@ import numpy as np
 from jax import lax
 from jaxtyping import Float
 
-from ....domains.patrol.process import Patrol, demonstrate, instance, simulate_patrol
+from ....domains.patrol.process import SECONDS_PER_STEP, Patrol, demonstrate, instance, simulate_patrol
 from ....domains.patrol.trials import REACHED, TIMED_OUT, BreachOutcome, breach_trials, greedy_policies
 from ....inference.completion.smoothing import evidence_of, smooth_all
 from ....inference.learners.lme import batch_lme, lme_i2rl, lme_i2rl_with_random_weights
@@ -518,15 +518,19 @@ def write(study: Study, folder: Path | str) -> Path:
     pictures = [
         drawn(
             folder, "policy", lambda theme: policy_map(
-                study.patrol, np.exp(np.asarray(policy)), study.observability, theme=theme,
+                study.patrol.mdp, np.exp(np.asarray(policy)), study.patrol.layout,
+                weights=study.patrol.weights, in_view=study.patrol.views[study.observability], theme=theme,
                 title=f"Policy of {first.name}",
+                note=f"{study.patrol.name}, {study.observability} % observability",
             ),
             "What the first patroller is believed to do in every state; tinted cells are in view.",
             "Map of the patrol with the learned policy as arrows",
         ),
         drawn(
             folder, "hidden-path", lambda theme: hidden_path(
-                study.patrol, study.stretch.posterior, study.stretch.seen, study.stretch.path, theme=theme
+                study.stretch.posterior, study.stretch.seen, study.patrol.layout, study.stretch.path,
+                seconds=SECONDS_PER_STEP, theme=theme,
+                title=f"Where the patroller may have been ({study.patrol.name})",
             ),
             "A stretch of patrol nobody learned from: belief about the hidden steps, given the seen ones.",
             "Probability of each cell over time, with the true path",

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ....models.inputs.display import shown_briefly
 from ....models.networks.modules import DTYPE, MLP, ActionSpace, ShapedReward
 from ....models.process.mdp import TabularMDP
 from ....models.process.planning import soft_plan
@@ -22,6 +23,7 @@ from ...completion.transitions import Completed, TransitionStatistic
 # -- discriminators -----------------------------------------------------------------------------------
 
 
+@shown_briefly
 class TabularDiscriminator(NamedTuple):
     """A classifier of transitions whose log-odds are a reward, evaluated on all of them at once.
 
@@ -126,6 +128,7 @@ def log_probability_of_mean(
 AVERAGES = {"log probabilities": mean_of_log_probability, "logits": log_probability_of_mean}
 
 
+@shown_briefly
 class Losses(NamedTuple):
     """Cross-entropy of the discriminator (nats), and the shares of either side that it tells right."""
 
@@ -134,6 +137,7 @@ class Losses(NamedTuple):
     generated_accuracy: Float[Array, ""]
 
 
+@shown_briefly
 class Sides(NamedTuple):
     """What a discriminator tells apart: the expert's transitions, and the generator's ``[S, A, B]``."""
 

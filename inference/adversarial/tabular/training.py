@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from ....models.inputs.display import shown_briefly
 from ...completion.transitions import TransitionStatistic, discounted_transitions, visited_transitions
 from .discriminator import AVERAGES
 
@@ -75,6 +76,7 @@ class TabularTraining(NamedTuple):
         return self
 
 
+@shown_briefly
 class TabularAdversarialState(NamedTuple):
     """All that is carried from session to session.
 
@@ -105,6 +107,7 @@ class TabularAdversarialState(NamedTuple):
         return jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(self.network)])
 
 
+@shown_briefly
 class TabularAdversarialInfo(NamedTuple):
     """What a session did.
 

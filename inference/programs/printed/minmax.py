@@ -37,11 +37,14 @@ from jaxtyping import Float
 from scipy.optimize import brentq, minimize
 from scipy.special import logsumexp, softmax
 
+from ....models.inputs.display import shown_briefly
+
 # The released code adds it to every denominator.
 _OFFSET = 1e-3
 _LEAST_ASSIGNMENT = 1e-6
 
 
+@shown_briefly
 class TrajectorySpace(NamedTuple):
     """Trajectories that could be, the demonstrated ones first.
 

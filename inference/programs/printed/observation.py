@@ -14,6 +14,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from ....models.inputs.display import shown_briefly
 from ....models.observation.agreement import predicate_classes, reported_matches
 from ..constraints import ProgramNotSolved
 from ..dual import COLD_OPTIONS
@@ -23,6 +24,7 @@ _PENALTIES = (1.0, 10.0, 100.0, 1e3, 1e4)
 _INSIDE = 1e-6
 
 
+@shown_briefly
 class PrintedSolution(NamedTuple):
     """Solution of the printed program.
 

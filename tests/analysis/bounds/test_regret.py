@@ -104,7 +104,7 @@ def test_the_empirical_regret_of_the_features_program_is_surely_bounded(mdp, pla
     # By hand, what the compiled run of all streams did.
     state = learner.init(jax.random.split(jax.random.key(1), 3)[2])
     for t in range(2):
-        state, report = learner.update(state, Demonstration(*(x[2, t] for x in data)))
+        state, report = learner.update(state, jax.tree.map(lambda x, t=t: x[2, t], data))
     assert gaps.weights[2, 1] == pytest.approx(report.weights, abs=1e-6)
     assert gaps.empirical[2, 1] == pytest.approx(
         learner.log_likelihood(state, TRUE) - report.log_likelihood, abs=1e-7

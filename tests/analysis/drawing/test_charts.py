@@ -3,7 +3,6 @@ from __future__ import annotations
 import struct
 import warnings
 from functools import cache
-from itertools import pairwise
 from pathlib import Path
 
 import jax
@@ -77,7 +76,14 @@ def curve(method: str, seeds: int = 3) -> figures.LearningCurve:
 def test_the_experts_own_map_has_no_disagreement(number: int, theme: style.Theme) -> None:
     patrol = instance(number)
     figure = drawn(
-        maps.policy_map(patrol, expert_policy(int(patrol.name[-1])), min(patrol.views), theme=theme)
+        maps.policy_map(
+            patrol.mdp,
+            expert_policy(number),
+            patrol.layout,
+            weights=patrol.weights,
+            in_view=patrol.views[min(patrol.views)],
+            theme=theme,
+        )
     )
     n = patrol.mdp.n_states
     assert f"{n} of {n} states as the expert (100.0 %)" in figure.get_suptitle()
@@ -94,7 +100,7 @@ def test_a_map_marks_exactly_the_states_that_differ() -> None:
     patrol = instance(2)
     policy = np.array(expert_policy(int(patrol.name[-1])))
     policy[[5, 17, 40]] = np.eye(4)[STOP]
-    figure = drawn(maps.policy_map(patrol, policy))
+    figure = drawn(maps.policy_map(patrol.mdp, policy, patrol.layout, weights=patrol.weights))
     (axes,) = charts(figure)
     wedges = [path for c in axes.collections if type(c) is PolyCollection for path in c.get_paths()]
     at = {(round(y), round(x)) for x, y in (path.vertices[:3].mean(0) for path in wedges)}
@@ -104,11 +110,13 @@ def test_a_map_marks_exactly_the_states_that_differ() -> None:
 
 
 def test_glyphs_point_where_the_action_leads() -> None:
-    north, east = 1, 0
-    ahead = maps._placed(np.array([(1.0, 0.0)]), (5.0, 2.0, north))
+    north, east = np.pi / 2, 0.0
+    ahead = maps._placed(np.array([(1.0, 0.0)]), np.array([2.0, 5.0]), north)
     np.testing.assert_allclose(ahead, [(2.0, 4.0)], atol=1e-12)
+    upward = maps._placed(np.array([(1.0, 0.0)]), np.array([2.0, 5.0]), north, down=1)
+    np.testing.assert_allclose(upward, [(2.0, 6.0)], atol=1e-12)
     # Facing east, the right hand points south: larger rows, at the bottom of the page.
-    hook = maps._placed(maps._GLYPHS[RIGHT].vertices, (0.0, 0.0, east))
+    hook = maps._placed(maps._FACING[RIGHT].vertices, np.zeros(2), east)
     assert hook[:, 1].max() > -hook[:, 1].min()
 
 
@@ -116,35 +124,42 @@ def test_soft_and_greedy_policies_of_the_same_weights_give_the_same_map() -> Non
     patrol = instance(3)
     soft = jax.jit(soft_plan)(patrol.mdp, reward_of(patrol.mdp, 50 * jnp.asarray(patrol.weights))).policy
     titles = [
-        maps.policy_map(patrol, policy).get_suptitle()
+        maps.policy_map(patrol.mdp, policy, patrol.layout, weights=patrol.weights).get_suptitle()
         for policy in (soft, greedy_policy(patrol.mdp, patrol.weights))
     ]
     assert titles[0] == titles[1]
     assert "184 of 184" in titles[0]
 
 
-def test_a_map_refuses_another_instances_policy_and_views_it_lacks() -> None:
-    patrol = instance(2)
-    with pytest.raises(ValueError, match=r"\(124, 4\), got \(3, 4\)"):
-        maps.policy_map(patrol, np.ones((3, 4)))
-    with pytest.raises(ValueError, match="no 55 % view"):
-        maps.policy_map(patrol, expert_policy(int(patrol.name[-1])), 55)
+def test_a_map_refuses_another_process_policy_view_or_layout() -> None:
+    patrol, policy = instance(2), expert_policy(2)
+    with pytest.raises(ValueError, match=r"\[S, A\] = \(124, 4\); got \(3, 4\)"):
+        maps.policy_map(patrol.mdp, np.ones((3, 4)), patrol.layout)
+    with pytest.raises(ValueError, match=r"in_view must have shape \[S\] = \(124,\); got \(3,\)"):
+        maps.policy_map(patrol.mdp, policy, patrol.layout, in_view=np.ones(3, bool))
+    with pytest.raises(ValueError, match="place the 124 states of the process; got 184"):
+        maps.policy_map(patrol.mdp, policy, instance(3).layout)
+    with pytest.raises(TypeError, match=r"layout must be a Layout, .* got Patrol"):
+        maps.value_map(patrol.mdp, np.ones(124), patrol)
+    with pytest.raises(ValueError, match=r"values must have shape \[S\] = \(124,\); got \(3,\)"):
+        maps.value_map(patrol.mdp, np.ones(3), patrol.layout)
 
 
 @pytest.mark.parametrize("number", [1, 2, 3])
 def test_corridors_hold_every_cell_once_and_each_can_be_walked(number: int) -> None:
-    cells = instance(number).cells
-    strands = maps.corridors(cells)
-    assert sorted(cell for strand in strands for cell in strand) == sorted(cells)
+    layout = instance(number).layout
+    strands = maps.corridors(layout)
+    assert sorted(i for strand in strands for i in strand) == list(range(layout.n_places))
     for strand in strands:
-        steps = [abs(a[0] - b[0]) + abs(a[1] - b[1]) for a, b in pairwise(strand)]
-        assert all(step == 1 for step in steps)
+        steps = np.abs(np.diff(layout.positions[list(strand)], axis=0)).sum(1)
+        assert (steps == 1).all()
     assert [len(s) for s in strands] == sorted((len(s) for s in strands), reverse=True)
 
 
 def test_the_hallway_of_the_second_instance_is_one_corridor() -> None:
-    (strand,) = maps.corridors(instance(2).cells)
-    assert (strand[0], strand[-1]) == ((0, 8), (16, 8))
+    layout = instance(2).layout
+    (strand,) = maps.corridors(layout)
+    assert (layout.names[strand[0]], layout.names[strand[-1]]) == ("(0,8)", "(16,8)")
 
 
 @pytest.mark.parametrize("theme", style.THEMES, ids=lambda theme: theme.name)
@@ -152,7 +167,9 @@ def test_the_hallway_of_the_second_instance_is_one_corridor() -> None:
 def test_a_hidden_path_shows_all_of_the_belief(number: int, observability: int, theme: style.Theme) -> None:
     patrol, demonstration, posterior = belief(number, observability)
     seen = demonstration.kind[0] == SEEN
-    figure = drawn(maps.hidden_path(patrol, posterior, seen, posterior.argmax(1), theme=theme))
+    figure = drawn(
+        maps.hidden_path(posterior, seen, patrol.layout, posterior.argmax(1), seconds=2.0, theme=theme)
+    )
     (axes,) = [axes for axes in figure.axes if axes.get_xlabel() == "time (s)"]
     (mesh,) = [c for c in axes.collections if isinstance(c, QuadMesh)]
     shown = np.asarray(mesh.get_array())
@@ -165,15 +182,14 @@ def test_a_hidden_path_shows_all_of_the_belief(number: int, observability: int, 
     assert "cell" in axes.get_ylabel()
     assert any(a.get_ylabel() == "probability of the cell" for a in figure.axes)
     names = [label.get_text() for label in axes.get_yticklabels()]
-    assert {f"({r},{c})" for r, c in (s[i] for s in maps.corridors(patrol.cells) for i in (0, -1))} <= set(
-        names
-    )
+    ends = {s[i] for s in maps.corridors(patrol.layout) for i in (0, -1)}
+    assert {patrol.layout.names[i] for i in ends} <= set(names)
 
 
 def test_a_hidden_path_refuses_a_belief_of_another_length() -> None:
     patrol = instance(2)
-    with pytest.raises(ValueError, match=r"\(4, 124\), got \(5, 124\)"):
-        maps.hidden_path(patrol, np.ones((5, 124)) / 124, np.ones(4, bool))
+    with pytest.raises(ValueError, match=r"\(4, 124\); got \(5, 124\)"):
+        maps.hidden_path(np.ones((5, 124)) / 124, np.ones(4, bool), patrol.layout)
 
 
 @pytest.mark.parametrize("theme", style.THEMES, ids=lambda theme: theme.name)
@@ -388,14 +404,14 @@ def test_names_of_methods_and_features_are_drawn_as_they_are() -> None:
 def test_drawing_leaves_matplotlibs_settings_alone() -> None:
     before = dict(mpl.rcParams)
     drawn(figures.learning_curves([curve("one")], theme=style.DARK))
-    drawn(maps.policy_map(instance(2), expert_policy(2), theme=style.DARK))
+    drawn(maps.policy_map(instance(2).mdp, expert_policy(2), instance(2).layout, theme=style.DARK))
     assert dict(mpl.rcParams) == before
 
 
 def test_both_themes_are_saved_as_small_png_files(tmp_path: Path) -> None:
     patrol = instance(1)
     paths = style.save_themes(
-        lambda theme: maps.policy_map(patrol, expert_policy(int(patrol.name[-1])), 30, theme=theme),
+        lambda theme: maps.policy_map(patrol.mdp, expert_policy(1), patrol.layout, theme=theme),
         tmp_path / "new",
         "map",
     )
@@ -412,7 +428,8 @@ def test_a_demonstration_seen_throughout_leaves_no_doubt() -> None:
     patrol, demonstration, posterior = belief(2, 100, 10)
     assert isinstance(demonstration, Demonstration)
     np.testing.assert_allclose(posterior[np.arange(10), demonstration.state[0]], 1.0)
-    figure = drawn(maps.hidden_path(patrol, posterior, demonstration.kind[0] == SEEN, demonstration.state[0]))
+    seen = demonstration.kind[0] == SEEN
+    figure = drawn(maps.hidden_path(posterior, seen, patrol.layout, demonstration.state[0], seconds=2.0))
     (axes,) = [axes for axes in figure.axes if axes.get_xlabel() == "time (s)"]
     (mesh,) = [c for c in axes.collections if isinstance(c, QuadMesh)]
     assert set(np.unique(np.asarray(mesh.get_array()).round(9))) == {0.0, 1.0}

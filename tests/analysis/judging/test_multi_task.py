@@ -1,3 +1,4 @@
+from dataclasses import replace
 from itertools import combinations, permutations
 
 import jax
@@ -7,7 +8,6 @@ import pytest
 from i2rl.analysis import assignment_accuracy, expected_value_difference, match_components
 from i2rl.analysis.judging.multi_task import adjusted_rand_index
 from i2rl.domains import demonstrate_sorting, sorting_with_claiming
-from i2rl.models import Demonstration
 
 
 def _values(mdp, weights, policy):
@@ -69,14 +69,14 @@ def test_value_difference_says_what_does_not_fit():
     sorting = sorting_with_claiming()
     mixed = demonstrate_sorting(jax.random.key(1), sorting, (1, 1), steps=3)
     given = [sorting.mdp, sorting.weights, mixed.labels, sorting.weights, mixed.labels, mixed.demonstration]
-    hidden = mixed.demonstration._replace(kind=np.array([[1, 1, 1], [1, 2, 1]], np.int8))
+    hidden = replace(mixed.demonstration, kind=np.array([[1, 1, 1], [1, 2, 1]], np.int8))
     for place, value, complaint in (
         (3, sorting.weights[:, :4], r"learned weights must have shape \[components, 11\]"),
         (3, np.full((2, 11), np.nan), "not a number"),
         (4, np.array([0, 3]), "between 0 and 2"),
         (2, np.array([0, 1, 1]), "each of 2 trajectories"),
         (5, hidden, "trajectory 1, step 1"),
-        (5, Demonstration(*(np.asarray(x)[:0] for x in mixed.demonstration)), "each of 0"),
+        (5, mixed.demonstration[:0], "each of 0"),
     ):
         with pytest.raises(ValueError, match=complaint):
             expected_value_difference(*[value if i == place else x for i, x in enumerate(given)])

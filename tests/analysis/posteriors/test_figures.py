@@ -154,7 +154,7 @@ def test_weights_by_session_shows_the_median_of_each_session(world):
 
 def test_a_path_of_another_domain_or_of_rows_that_do_not_exist_is_refused(posterior):
     with pytest.raises(InferenceDataError):
-        completed_path(instance(2), posterior, [0])
+        completed_path(instance(2).mdp, posterior, [0], instance(2).layout)
 
 
 def test_a_figure_of_no_posterior_is_refused():

@@ -1,5 +1,7 @@
 """A jumble seen whole and the same jumble, completed, are explained alike."""
 
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -37,7 +39,7 @@ def demonstration(mdp):
     # Of unequal length, and one row more than there are trajectories.
     kind = np.array(long.kind)
     kind[1, 4:] = 0
-    return long._replace(kind=kind).padded(4, 8)
+    return replace(long, kind=kind).padded(4, 8)
 
 
 @pytest.mark.parametrize("sensor", [Sensor(), Visibility(np.array([1.0, 0.4, 0.7, 1.0, 0.9]))])
@@ -62,7 +64,7 @@ def test_a_hidden_step_asks_for_completion(mdp, policies, demonstration):
     kind = np.array(demonstration.kind)
     state, action = np.array(demonstration.state), np.array(demonstration.action)
     kind[0, 2], state[0, 2], action[0, 2] = HIDDEN, -1, -1
-    gappy = demonstration._replace(kind=kind, state=state, action=action)
+    gappy = replace(demonstration, kind=kind, state=state, action=action)
     sensor = Visibility(np.array([1.0, 0.4, 0.7, 1.0, 0.9]))
     assert not is_seen_whole(sensor, gappy)
     explained = explain(mdp, policies[0], seen_in_part(mdp, sensor, gappy))
@@ -75,7 +77,7 @@ def test_an_unavailable_action_cannot_have_happened(mdp, policies, demonstration
     s, a = (int(x) for x in np.argwhere(~np.asarray(mdp.available))[0])
     state, action = np.array(demonstration.state), np.array(demonstration.action)
     state[0, 0], action[0, 0] = s, a
-    wrong = demonstration._replace(state=state, action=action)
+    wrong = replace(demonstration, state=state, action=action)
     explained = explain(mdp, policies[0], seen_whole(mdp, Sensor(), wrong))
     assert np.asarray(explained.log_likelihood)[0] == -np.inf
     assert np.isfinite(np.asarray(explained.log_likelihood)[1:]).all()

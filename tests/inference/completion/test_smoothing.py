@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import partial
 
 import jax
@@ -320,7 +321,7 @@ def test_relabelling_states_relabels_the_posterior(
     there = exact(
         moved,
         log_policy[order],
-        evidence_of(moved, Visibility(visibility[order]), demonstration._replace(state=state)),
+        evidence_of(moved, Visibility(visibility[order]), replace(demonstration, state=state)),
     )
     np.testing.assert_allclose(there.log_likelihood, here.log_likelihood, atol=1e-10)
     np.testing.assert_allclose(there.counts, np.asarray(here.counts)[order], atol=1e-10)

@@ -144,9 +144,7 @@ def test_a_fleet_learns_what_its_members_would_and_nothing_from_the_impossible(w
     learner = darko_i2rl(world, learning_rate=0.2)
     many = fleet(learner)
     states = many.init(jax.random.key(4), 3)
-    stacked = Demonstration(
-        *(np.stack(parts) for parts in zip(*sessions, impossible_pair(world), strict=True))
-    )
+    stacked = jax.tree.map(lambda *parts: np.stack(parts), *sessions, impossible_pair(world))
     after, infos = many.update(states, stacked)
     for i, session in enumerate(sessions):
         state, info = learner.update(jax.tree.map(operator.itemgetter(i), states), session)

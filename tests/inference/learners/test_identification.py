@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -68,7 +69,7 @@ def test_what_does_not_fit_is_refused():
         sensor_identification(shown.mdp, task.features, shown.seen, weights, scores="some")
     with pytest.raises(ValueError, match="fitted, not given"):
         sensor_identification(shown.mdp, task.features, shown.seen, weights, view=task.noise)
-    lost = shown.seen._replace(kind=np.full_like(shown.seen.kind, LOST))
+    lost = replace(shown.seen, kind=np.full_like(shown.seen.kind, LOST))
     with pytest.raises(DemonstrationError, match="nothing was reported"):
         sensor_identification(shown.mdp, task.features, lost, weights)
     reportable = np.ones(shown.mdp.available.shape, bool)

@@ -168,7 +168,7 @@ def test_an_action_that_does_not_exist_is_refused(random_mdp):
     with pytest.raises(DemonstrationError, match="step 0: state 9 is out of range"):
         learner.update(learner.init(jax.random.key(0)), Demonstration.from_pairs([[9]], [[0]]))
     many = fleet(learner)
-    stacked = Demonstration(*(np.asarray(x)[None] for x in impossible))
+    stacked = jax.tree.map(lambda x: np.asarray(x)[None], impossible)
     state, info = many.update(many.init(jax.random.key(0), 1), stacked)
     assert state.session[0] == 0
     assert np.isneginf(info.demonstration_log_likelihood[0])
@@ -179,7 +179,7 @@ def test_a_fleet_learns_what_its_members_would(world):
     demonstrations = [walk(world, np.array([2, 1, 0, 2, 1, 1]), seed, 4) for seed in range(3)]
     learner = jin_i2rl_with_features(world, learning_rate=0.1)
     many = fleet(learner)
-    stacked = Demonstration(*(np.stack(parts) for parts in zip(*demonstrations, strict=True)))
+    stacked = jax.tree.map(lambda *parts: np.stack(parts), *demonstrations)
     states, infos = many.update(many.init(jax.random.key(0), 3), stacked)
     for i, demonstration in enumerate(demonstrations):
         state, info = learner.update(learner.init(jax.random.key(1)), demonstration)

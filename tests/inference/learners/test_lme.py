@@ -300,7 +300,7 @@ def test_a_schedule_counts_each_streams_sessions_in_a_fleet(mdp, sensor, demonst
     parts = [demonstration.select(slice(4, 6)), demonstration.select(slice(6, 8))]
     alone = [learner.update(s, d)[0].weights for s, d in zip(states, parts, strict=True)]
     stacked = jax.tree.map(lambda *leaves: jnp.stack(leaves), *states)
-    both = Demonstration(*(np.stack(leaves) for leaves in zip(*parts, strict=True)))
+    both = jax.tree.map(lambda *leaves: np.stack(leaves), *parts)
     together, _ = fleet(learner).update(stacked, both)
     assert together.session.tolist() == [3, 1]
     assert np.allclose(together.weights, alone, atol=1e-6)
@@ -343,7 +343,7 @@ def test_a_schedule_that_turns_negative_late_is_refused_when_it_does(mdp, sensor
         learner.update(state, demonstration)
     # A fleet raises nothing, but its weights stay what they were.
     one = jax.tree.map(lambda x: x[None], state)
-    after, _ = fleet(learner).update(one, Demonstration(*(x[None] for x in demonstration)))
+    after, _ = fleet(learner).update(one, jax.tree.map(lambda x: x[None], demonstration))
     assert np.array_equal(after.weights[0], state.weights)
 
 

@@ -1,6 +1,7 @@
 """MME-MTIRL finds how many ways of sorting there are, who did what, and the reward of each."""
 
 import warnings
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -84,7 +85,8 @@ def test_half_hidden_trajectories_are_told_apart(sorting):
     mixed = demonstrate_sorting(jax.random.key(7), sorting, (8, 8), 25)
     whole = mixed.demonstration
     hidden = np.random.default_rng(0).random(whole.kind.shape) < 0.5
-    seen = whole._replace(
+    seen = replace(
+        whole,
         kind=np.where(hidden, HIDDEN, whole.kind),
         state=np.where(hidden, UNKNOWN, whole.state),
         action=np.where(hidden, UNKNOWN, whole.action),
@@ -180,7 +182,7 @@ def test_what_a_report_says_of_all_that_is_kept_is_the_learner_s_log_likelihood(
 def test_streams_whose_first_session_is_empty_learn_from_the_next(sorting):
     learner = mme_mtirl(sorting.mdp, n_components=2, restarts=1)
     demonstration = demonstrate_sorting(jax.random.key(0), sorting, (2, 2), 20).demonstration
-    empty = demonstration._replace(kind=np.full_like(demonstration.kind, PAD))
+    empty = replace(demonstration, kind=np.full_like(demonstration.kind, PAD))
     stream = jax.tree.map(lambda *x: np.stack(x)[None], empty, demonstration, empty)
     state, info = run_streams(learner, jax.random.key(0), stream)
     np.testing.assert_array_equal(info.n_components, [[0, 2, 2]])
@@ -236,7 +238,7 @@ def unavailable(sorting):
     state, action = np.array(mixed.state), np.array(mixed.action)
     s = state[3, 2]
     action[3, 2] = np.flatnonzero(~np.asarray(sorting.mdp.available)[s])[0]
-    return mixed._replace(action=action), sorting.mdp.state_names[s]
+    return replace(mixed, action=action), sorting.mdp.state_names[s]
 
 
 def test_an_unavailable_action_is_named_and_costs_nothing_learned(sorting, batch, online):
@@ -279,6 +281,6 @@ def test_a_hidden_step_is_named_where_nothing_can_hide(sorting):
     demonstration = demonstrate_sorting(jax.random.key(0), sorting, (2, 2), STEPS).demonstration
     kind = np.array(demonstration.kind)
     kind[1, 3] = HIDDEN
-    hidden = demonstration._replace(kind=kind)
+    hidden = replace(demonstration, kind=kind)
     with pytest.raises(DemonstrationError, match="trajectory 1, step 3: impossible observation: hidden"):
         assign_trajectories(sorting.mdp, None, sorting.weights, np.full(3, 1 / 3), hidden)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -113,7 +114,7 @@ def test_with_a_reliable_sensor_it_is_online_maximum_entropy_irl():
 
 def test_a_score_of_nearly_one_makes_reports_the_truth():
     _mdp, _, truth = stream()
-    sure = [x._replace(score=np.where(x.kind == SEEN, 1.0, np.nan)) for x in truth]
+    sure = [replace(x, score=np.where(x.kind == SEEN, 1.0, np.nan)) for x in truth]
     report = run_sessions(learned_with("stepwise"), sure, key=KEY).infos[-1]
     assert report.agreement.min() > 0.99
 
@@ -124,7 +125,8 @@ def test_what_is_hidden_as_well_is_summed_out():
     hidden = np.random.default_rng(0).random((2, 3)) < 0.5
     hidden[0, 0] = False
     partly = [
-        x._replace(
+        replace(
+            x,
             kind=np.where(hidden, HIDDEN, x.kind), state=np.where(hidden, -1, x.state),
             action=np.where(hidden, -1, x.action), score=np.where(hidden, np.nan, x.score),
         )
@@ -207,7 +209,7 @@ def test_a_fleet_learns_what_its_learners_learn():
         alone = learner.update(learner.init(key), seen[i])[1]
         np.testing.assert_allclose(reports.agreement[i], alone.agreement, atol=1e-8)
     # A fleet raises nothing; what cannot be leaves its learner as it was.
-    left, reports = many.update(states, both._replace(state=both.state + np.array([99, 0])[:, None, None]))
+    left, reports = many.update(states, replace(both, state=both.state + np.array([99, 0])[:, None, None]))
     np.testing.assert_array_equal(np.isneginf(reports.demonstration_log_likelihood), [True, False])
     for field in ("weights", "logits", "session"):
         np.testing.assert_array_equal(getattr(left, field)[0], getattr(states, field)[0])
@@ -273,12 +275,12 @@ def test_scores_that_are_missing_or_no_probabilities_are_named():
     score = seen[0].score.copy()
     score[1, 2] = 1.2
     with pytest.raises(DemonstrationError, match=r"trajectory 1, step 2: score must lie in \[0, 1\]"):
-        learner.update(state, seen[0]._replace(score=score))
+        learner.update(state, replace(seen[0], score=score))
     score[1, 2] = np.nan
     with pytest.raises(DemonstrationError, match="trajectory 1, step 2: the report has no score"):
-        learner.update(state, seen[0]._replace(score=score))
+        learner.update(state, replace(seen[0], score=score))
     partly = rimeo(mdp, task().features, unscored=True)
-    assert np.isfinite(partly.update(partly.init(KEY), seen[0]._replace(score=score))[1].agreement).all()
+    assert np.isfinite(partly.update(partly.init(KEY), replace(seen[0], score=score))[1].agreement).all()
 
 
 def test_predicates_of_another_shape_and_silent_ones_are_named():
@@ -322,7 +324,7 @@ def test_truths_that_do_not_fit_the_reports_are_named():
     lost = truth[0].state.copy()
     lost[1, 2] = -1
     with pytest.raises(DemonstrationError, match="trajectory 1, step 2: what happened must be a pair"):
-        learner.update(state, WithTruth(seen[0], truth[0]._replace(state=lost)))
+        learner.update(state, WithTruth(seen[0], replace(truth[0], state=lost)))
     with pytest.raises(ValueError, match="forgetting is an exponent"):
         rifom(mdp, task().features, forgetting=2.0)
 

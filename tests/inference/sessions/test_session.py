@@ -1,3 +1,4 @@
+from dataclasses import replace
 from typing import NamedTuple
 
 import jax
@@ -130,7 +131,7 @@ def test_an_impossible_observation_leaves_a_fleets_learner_as_it_was(world):
     many = fleet(lme_i2rl(mdp, sensor))
     states = many.init(jax.random.key(0), 2)
     steps = [Demonstration.from_pairs([[0]], [[1]]), Demonstration.from_pairs([[5]], [[1]])]
-    stacked = Demonstration(*(np.stack(parts) for parts in zip(*steps, strict=True)))
+    stacked = jax.tree.map(lambda *parts: np.stack(parts), *steps)
     after, reports = many.update(states, stacked)
     assert np.isfinite(reports.demonstration_log_likelihood).tolist() == [True, False]
     assert after.session.tolist() == [1, 0]
@@ -179,7 +180,7 @@ def test_a_fleet_learns_what_each_learner_alone_would(world, stream):
     many = fleet(learner)
     states = many.init(jax.random.key(5), 3)
     streams = [stream.select([i, i + 1]) for i in range(3)]
-    stacked = Demonstration(*(np.stack(parts) for parts in zip(*streams, strict=True)))
+    stacked = jax.tree.map(lambda *parts: np.stack(parts), *streams)
     states, reports = many.update(states, stacked)
     keys = jax.random.split(jax.random.key(5), 3)
     for i, one in enumerate(streams):
@@ -196,7 +197,7 @@ def test_a_learner_whose_solver_is_outside_jax_makes_no_fleet(world):
 def test_whole_streams_in_one_program_learn_what_each_learner_alone_would(world, stream):
     learner = lme_i2rl(*world)
     parts = [stream.select([2 * i, 2 * i + 1]) for i in range(2)]
-    arrays = Demonstration(*(np.stack([x[:, None] for x in leaves]) for leaves in zip(*parts, strict=True)))
+    arrays = jax.tree.map(lambda *leaves: np.stack([x[:, None] for x in leaves]), *parts)
     states, reports = run_streams(learner, jax.random.key(5), arrays)
     _, sizes = run_streams(learner, jax.random.key(5), arrays, lambda state, report: state.statistic.size)
     assert sizes.tolist() == [[1, 2], [1, 2]]
@@ -341,7 +342,7 @@ def test_a_demonstration_has_one_digest_whatever_holds_it():
     steps = Demonstration.from_pairs([[0, 1]], [[1, 0]])
     padded = steps.padded(4, 8)
     as_jax = jax.tree.map(jnp.asarray, steps)
-    wide = steps._replace(state=steps.state.astype(np.int64), score=np.array([[-np.nan, np.nan]]))
+    wide = replace(steps, state=steps.state.astype(np.int64), score=np.array([[-np.nan, np.nan]]))
     assert (
         len(
             {
@@ -354,8 +355,8 @@ def test_a_demonstration_has_one_digest_whatever_holds_it():
     others = [
         Demonstration.from_pairs([[0, 1]], [[1, 1]]),
         Demonstration.from_pairs([[0], [1]], [[1], [0]]),
-        steps._replace(score=np.array([[0.5, np.nan]])),
-        steps._replace(kind=np.array([[2, 1]])),
+        replace(steps, score=np.array([[0.5, np.nan]])),
+        replace(steps, kind=np.array([[2, 1]])),
         steps.select([]),
     ]
     assert len({demonstration_digest(x) for x in (steps, *others)}) == 6

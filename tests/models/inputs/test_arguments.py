@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import pickle
+from dataclasses import replace
 
 import jax
 import jax.numpy as jnp
@@ -264,7 +265,7 @@ def test_what_is_no_demonstration_is_refused_with_what_to_pass(use):
 
 
 def changed(**fields):
-    return OUTSIDE.select([0])._replace(**{n: np.asarray(x)[None] for n, x in fields.items()})
+    return replace(OUTSIDE.select([0]), **{n: np.asarray(x)[None] for n, x in fields.items()})
 
 
 @pytest.mark.parametrize(
@@ -312,7 +313,7 @@ def test_compiled_programs_give_indices_of_nothing_probability_zero():
 def test_a_fleet_keeps_its_state_where_an_index_is_of_no_state():
     crew = fleet(lme_i2rl(MDP, NOISE, iterations=2))
     state = crew.init(KEY, 1)
-    new, info = crew.update(state, Demonstration(*(jnp.asarray(x)[None] for x in OUTSIDE.bucketed())))
+    new, info = crew.update(state, jax.tree.map(lambda x: jnp.asarray(x)[None], OUTSIDE.bucketed()))
     assert info.demonstration_log_likelihood[0] == -np.inf
     np.testing.assert_array_equal(new.weights, state.weights)
 

@@ -5,8 +5,10 @@ from __future__ import annotations
 import doctest
 import io
 import json
+import pickle
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pandas as pd
@@ -44,7 +46,7 @@ def read(text, mdp=NAMED, **options):
 
 
 def assert_same(one, two):
-    for a, b in zip(one, two, strict=True):
+    for a, b in zip(one.arrays, two.arrays, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -192,7 +194,7 @@ def test_pairs_fill_one_trajectory_or_many():
     one = Demonstration.from_pairs(np.array([0, 1]), np.array([1, 0]))
     assert one.kind.shape == (1, 2)
     two = Demonstration.from_pairs(np.array([[0, 1], [2, 2]]), np.zeros((2, 2)))
-    assert_same(two.select([0])[1:2], (np.array([[0, 1]]),))
+    np.testing.assert_array_equal(two.select([0]).state, [[0, 1]])
 
 
 def test_buckets_are_powers_of_two():
@@ -249,14 +251,15 @@ def test_fragments_hold_every_step_once_in_order(demo, length):
     fragments = demo.fragments(length)
     assert fragments.lengths.max() <= length
     assert fragments.lengths.min() >= 1
-    for before, after in zip(demo, fragments, strict=True):
+    for before, after in zip(demo.arrays, fragments.arrays, strict=True):
         np.testing.assert_array_equal(before[demo.kind != PAD], after[fragments.kind != PAD])
     assert fragments.n_trajectories == sum(-(-total // length) for total in demo.lengths)
 
 
 @given(demo=demonstrations)
 def test_codes_carry_all_but_the_scores(demo):
-    assert_same(Demonstration.from_codes(demo.codes)[:3], demo[:3])
+    for a, b in zip(Demonstration.from_codes(demo.codes).arrays[:3], demo.arrays[:3], strict=True):
+        np.testing.assert_array_equal(a, b)
     assert np.isnan(Demonstration.from_codes(demo.codes).score).all()
 
 
@@ -340,7 +343,7 @@ def test_hidden_steps_may_be_missing_in_arrays_of_any_library(case):
     states, actions = columns(fill)
     demo = Demonstration.from_arrays(array(states), array(actions), lengths=[3, 2], **options)
     assert_same(demo, HIDDEN_DEMO)
-    assert [x.dtype for x in demo] == [np.int8, np.int32, np.int32, float]
+    assert [x.dtype for x in demo.arrays] == [np.int8, np.int32, np.int32, float]
 
 
 def test_what_is_not_seen_lost_or_beyond_the_end_is_not_looked_at():
@@ -573,3 +576,64 @@ def test_lines_are_not_a_name(lines):
 def test_the_examples_run():
     for module in (i2rl.models.observation.demonstration, i2rl.models.inputs.text):
         assert doctest.testmod(module).failed == 0
+
+
+# -- a container of trajectories ------------------------------------------------------------------------
+
+
+@given(demo=demonstrations)
+def test_a_demonstration_is_as_long_as_its_trajectories_are_many(demo):
+    assert len(demo) == demo.n_trajectories == len(list(demo))
+    assert_same(concatenate(list(demo)), demo)
+    for i, one in enumerate(demo):
+        assert len(one) == 1
+        np.testing.assert_array_equal(one.kind[0], demo.kind[i])
+        assert_same(one, demo[i])
+        assert_same(one, demo[i - len(demo)])
+
+
+def test_trajectories_are_selected_as_rows_of_an_array_are():
+    demo = Demonstration.from_pairs(np.arange(12).reshape(4, 3), np.zeros((4, 3)))
+    mask = np.array([True, False, False, True])
+    backward = slice(None, None, -1)
+    for rows in (slice(1, None), backward, [2, 0, 0], mask, mask.tolist(), np.array([], int), []):
+        chosen = np.zeros(0, int) if isinstance(rows, list) and not rows else rows
+        for whole, part in zip(demo.arrays, demo[rows].arrays, strict=True):
+            np.testing.assert_array_equal(part, whole[chosen])
+    assert_same(demo[np.int64(2)], demo.select([2]))
+
+
+@pytest.mark.parametrize(
+    ("rows", "error", "named"),
+    [
+        (3, IndexError, "0 to 2; got 3"),
+        (-4, IndexError, "0 to 2; got -4"),
+        ([0, 7], IndexError, "got 7"),
+        ([True, False], IndexError, "a mask of 3 trajectories has as many entries; got 2"),
+        ("kind", TypeError, "a number, a slice, a mask .* got 'kind'"),
+        (1.5, TypeError, "got 1.5"),
+        (None, TypeError, "got None"),
+        (True, TypeError, "got True"),
+        ((0, 1, [2]), TypeError, "a number, a slice"),
+    ],
+)
+def test_what_selects_no_trajectories_is_refused(rows, error, named):
+    demo = Demonstration.from_pairs(np.zeros((3, 2)), np.zeros((3, 2)))
+    with pytest.raises(error, match=named):
+        demo[rows]
+
+
+def test_a_demonstration_is_a_tree_of_its_arrays_and_survives_a_pickle():
+    demo = Demonstration.from_pairs([[0, 1]], [[1, 0]])
+    paths = [jax.tree_util.keystr(p, simple=True) for p, _ in jax.tree_util.tree_leaves_with_path(demo)]
+    assert paths == ["kind", "state", "action", "score"]
+    assert_same(pickle.loads(pickle.dumps(demo)), demo)
+    assert_same(jax.jit(lambda d: d)(demo), demo)
+    assert jax.jit(lambda d: len(d) * d.state.sum())(demo) == 1
+    with pytest.raises(AttributeError):
+        demo.kind = None
+
+
+def test_a_demonstration_does_not_become_an_array_of_something():
+    with pytest.raises(TypeError, match="its attribute `codes` is one"):
+        np.asarray(Demonstration.from_pairs([[0, 1]], [[1, 0]]))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -223,7 +224,7 @@ def test_hidden_and_wrong_reports_cost_little_where_they_are_understood(
     assert mean_distance(sensor_learned) < 0.6 * mean_distance(taken)
     # A session in which nothing was seen says nothing to those who believe their eyes.
     blank = watched[1].select(slice(0, 64))
-    blank = blank._replace(kind=np.where(blank.kind > 0, HIDDEN, blank.kind), state=0 * blank.state - 1)
+    blank = replace(blank, kind=np.where(blank.kind > 0, HIDDEN, blank.kind), state=0 * blank.state - 1)
     fresh = at_face_value.init(jax.random.key(0))
     after, _ = at_face_value.update(fresh, blank)
     np.testing.assert_array_equal(after.weights, fresh.weights)
@@ -273,7 +274,7 @@ def test_reports_that_cannot_be_leave_the_learner_as_it_was(mdp, learned: Learne
     seen = watched[1].select(slice(0, 64))
     state = learned.init(jax.random.key(0))
     i, t = np.argwhere(np.asarray(seen.state) == 0)[0]
-    impossible = seen._replace(state=seen.state.copy())
+    impossible = replace(seen, state=seen.state.copy())
     impossible.state[i, t] = 1  # never in view
     with pytest.raises(DemonstrationError, match=f"trajectory {i}, step {t}: impossible"):
         learned.update(state, impossible)
@@ -281,9 +282,9 @@ def test_reports_that_cannot_be_leave_the_learner_as_it_was(mdp, learned: Learne
     with pytest.raises(DemonstrationError, match=f"trajectory {i}, step {t}: state 9 is out of range"):
         learned.update(state, impossible)
     with pytest.raises(DemonstrationError, match="horizon"):
-        learned.update(state, seen.padded(64, 8)._replace(kind=np.ones((64, 8), np.int8)))
+        learned.update(state, replace(seen.padded(64, 8), kind=np.ones((64, 8), np.int8)))
     with pytest.raises(DemonstrationError, match="at least one trajectory"):
-        learned.update(state, seen._replace(kind=np.zeros_like(seen.kind)))
+        learned.update(state, replace(seen, kind=np.zeros_like(seen.kind)))
 
 
 @pytest.mark.parametrize(
