@@ -139,7 +139,7 @@ def test_a_map_refuses_another_process_policy_view_or_layout() -> None:
         maps.policy_map(patrol.mdp, policy, patrol.layout, in_view=np.ones(3, bool))
     with pytest.raises(ValueError, match="place the 124 states of the process; got 184"):
         maps.policy_map(patrol.mdp, policy, instance(3).layout)
-    with pytest.raises(TypeError, match="layout must be a Layout, .* got Patrol"):
+    with pytest.raises(TypeError, match=r"layout must be a Layout, .* got Patrol"):
         maps.value_map(patrol.mdp, np.ones(124), patrol)
     with pytest.raises(ValueError, match=r"values must have shape \[S\] = \(124,\); got \(3,\)"):
         maps.value_map(patrol.mdp, np.ones(3), patrol.layout)
