@@ -385,7 +385,9 @@ def _program(
     if price == 0:
         raise ValueError("price must be more than zero: every trajectory would be a way of its own")
     reachable = jnp.asarray(reachable_states(mdp))
-    return MixtureProgram(mdp, reachable, strength, l1, ridge, price, iterations, tolerance)
+    # Of one type whatever was given: 1 and 1.0 are different programs to the compiler.
+    numbers = (float(x) for x in (strength, l1, ridge, price))
+    return MixtureProgram(mdp, reachable, *numbers, int(iterations), float(tolerance))
 
 
 _seen_whole, _seen_in_part = jax.jit(seen_whole), jax.jit(seen_in_part)

@@ -8,8 +8,9 @@ gets one joint completion of the demonstration by backward sampling. Together th
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import arviz as az
 import jax
@@ -37,7 +38,7 @@ from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted, reward_of, soft_plan
 from ...version import __version__
 from ..completion.smoothing import Evidence, evidence_of, log_likelihoods
-from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
+from .chains import Mode, Transitions, in_threads, mode_of, room_for, run_nuts
 
 
 class Problem(NamedTuple):
@@ -85,7 +86,14 @@ def nuts_chain(
     Starts at unconstrained weights ``start`` with a dense ``inverse_mass``; both that matrix and the step
     size are adapted during ``warmup``.
     """
-    kernel = NUTS(
+    kernel = _kernel(problem, inverse_mass, target_accept, max_tree_depth)
+    return Chain(*run_nuts(key, kernel, start, dist.biject_to(problem.prior.support), warmup, draws))
+
+
+def _kernel(
+    problem: Problem, inverse_mass: Float[Array, "D D"], target_accept: Any, max_tree_depth: int
+) -> NUTS:
+    return NUTS(
         potential_fn=lambda z: potential(z, problem),
         dense_mass=True,
         inverse_mass_matrix=inverse_mass,
@@ -93,10 +101,27 @@ def nuts_chain(
         target_accept_prob=target_accept,
         max_tree_depth=max_tree_depth,
     )
-    return Chain(*run_nuts(key, kernel, start, dist.biject_to(problem.prior.support), warmup, draws))
 
 
-_run_chain = jax.jit(nuts_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
+@partial(jax.jit, static_argnames=("warmup", "room", "max_tree_depth"))
+def _run_chain(
+    key: Array,
+    problem: Problem,
+    start: Float[Array, " D"],
+    inverse_mass: Float[Array, "D D"],
+    draws: Int[Array, ""],
+    target_accept: Float[Array, ""],
+    *,
+    warmup: int,
+    room: int,
+    max_tree_depth: int,
+) -> Chain:
+    """:func:`nuts_chain` with room for ``room`` draws, of which the first ``draws`` are made."""
+    kernel = _kernel(problem, inverse_mass, target_accept, max_tree_depth)
+    constrain = dist.biject_to(problem.prior.support)
+    return Chain(*run_nuts(key, kernel, start, constrain, warmup, draws, room))
+
+
 _potential_and_gradient = jax.jit(jax.value_and_grad(potential))
 
 
@@ -152,6 +177,39 @@ def pointwise_log_likelihood(weights: Float[Array, "D K"], problem: Problem) -> 
     return lax.map(one, weights)
 
 
+_split = jax.jit(jax.random.split, static_argnums=1)
+# Draws that are looked at in one call: one program then serves every number of draws.
+_BLOCK = 50
+_FEWEST_ROWS = 32
+# A draw of the weights takes next to no memory.
+_FEWEST_DRAWS = 512
+
+
+def _room_for_draws(draws: int) -> int:
+    return max(_FEWEST_DRAWS, 1 << (draws - 1).bit_length())
+
+
+@jax.jit
+def _complete_block(
+    keys: Array, start: Int[Array, ""], weights: Float[Array, "B K"], problem: Problem, rows: Int[Array, " n"]
+) -> Completions:
+    """:func:`complete` for a block of draws, whose keys begin at ``start``."""
+    return complete(lax.dynamic_slice_in_dim(keys, start, len(weights)), weights, problem, rows)
+
+
+def _in_blocks(function: Callable[[int, np.ndarray], Any], weights: Float[np.ndarray, "D K"]) -> Any:
+    """Call ``function`` with the number of its first draw and ``_BLOCK`` draws, until all had their turn.
+
+    The last block is filled up with copies of the last draw; results ``[D, ...]`` are joined without them.
+    """
+    blocks = []
+    for start in range(0, len(weights), _BLOCK):
+        block = weights[start : start + _BLOCK]
+        filled = np.concatenate([block, np.repeat(block[-1:], _BLOCK - len(block), axis=0)])
+        blocks.append(jax.tree.map(np.asarray, function(start, filled)))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(weights)], *blocks)
+
+
 def posterior_mode(problem: Problem) -> Mode:
     """The mode of the unconstrained density, climbed to from its origin.
 
@@ -170,15 +228,15 @@ def gather(
 ) -> tuple[Problem, Int[np.ndarray, " n"]]:
     """The posterior's problem with identical trajectories gathered, and the row each trajectory became.
 
-    Most fragments of a little-seen expert are wholly hidden, hence identical. Rows are padded to a multiple
-    of eight, so that growing demonstrations meet few shapes.
+    Most fragments of a little-seen expert are wholly hidden, hence identical. Rows are padded to one of few
+    multiples of eight, so that growing demonstrations meet few shapes.
     """
     sensor = fitting_sensor(sensor, mdp)
     codes = np.asarray(checked_demonstration(mdp, demonstration).codes)
     distinct, rows, repeats = np.unique(
         codes.reshape(len(codes), -1), axis=0, return_inverse=True, return_counts=True
     )
-    spare = -len(distinct) % 8
+    spare = -(-room_for(len(distinct)) // 8) * 8 - len(distinct)
     distinct = distinct.reshape(-1, *codes.shape[1:])
     # A row of padding has probability one, whatever the weights.
     distinct = np.concatenate([distinct, np.broadcast_to([PAD, UNKNOWN, UNKNOWN], (spare, *codes.shape[1:]))])
@@ -257,21 +315,28 @@ def sample_posterior(
     start_key, chain_key, completion_key = jax.random.split(key, 3)
     spread = 2.0 * np.linalg.cholesky(mode.covariance)
     starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
-    run = partial(
-        _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
-    )
+    run = partial(_run_chain, warmup=warmup, room=_room_for_draws(draws), max_tree_depth=max_tree_depth)
     keys = jax.random.split(chain_key, chains)
     chain: Chain = in_threads(
-        run, [(k, problem, x, mode.covariance) for k, x in zip(keys, starts, strict=True)]
+        run,
+        [
+            (k, problem, x, mode.covariance, draws, float(target_accept))
+            for k, x in zip(keys, starts, strict=True)
+        ],
     )
-    flat = jnp.asarray(chain.weights.reshape(chains * draws, -1))
+    chain = jax.tree.map(lambda x: x[:, :draws], chain)
+    flat = chain.weights.reshape(chains * draws, -1)
     shape = (chains, draws, demonstration.n_trajectories)
-    log_likelihood = np.asarray(pointwise_log_likelihood(flat, problem))[:, rows].reshape(shape)
+    log_likelihood = _in_blocks(lambda _, w: pointwise_log_likelihood(w, problem), flat)[:, rows]
     completed = None
     if completions:
-        keys = jax.random.split(completion_key, chains * draws)
-        drawn = complete(keys, flat, problem, jnp.asarray(rows))
-        completed = Completions(*(x.reshape(*shape, -1) for x in drawn))
+        blocks = -(-len(flat) // _BLOCK)
+        keys = _split(completion_key, room_for(blocks, least=1) * _BLOCK)
+        padded = np.zeros(room_for(len(rows), _FEWEST_ROWS), rows.dtype)
+        padded[: len(rows)] = rows
+        drawn = _in_blocks(lambda start, w: _complete_block(keys, start, w, problem, padded), flat)
+        completed = Completions(*(x[:, : len(rows)].reshape(*shape, -1) for x in drawn))
+    log_likelihood = log_likelihood.reshape(shape)
     idata = _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
     for attrs in (idata.attrs, idata["posterior"].attrs):
         attrs["key"] = str(np.asarray(jax.random.key_data(key)).tolist())
