@@ -52,11 +52,11 @@ PLANNING = {
 
 @pytest.mark.parametrize("function", PLANNING.values(), ids=PLANNING)
 def test_planning_compiles_nothing_at_a_second_call(function, random_mdp):
-    mdp, other = random_mdp(0), random_mdp(1)
+    mdp = random_mdp(0)
     policy = jnp.full(mdp.available.shape, 1 / mdp.n_actions)
     rewards = [reward_of(mdp, jnp.array(weights)) for weights in ([1.0, -1.0], [0.5, 2.0])]
     function(mdp, rewards[0], policy)
-    assert compilations(function, other, rewards[1], policy) == 0
+    assert compilations(function, mdp, rewards[1], policy) == 0
 
 
 def perceived(random_mdp, imperfect_demonstration, seed, n):

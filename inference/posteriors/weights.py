@@ -38,6 +38,7 @@ from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted, reward_of, soft_plan
 from ...version import __version__
 from ..completion.smoothing import Evidence, evidence_of, log_likelihoods
+from ..sessions.progress import told
 from .chains import Mode, Transitions, in_threads, mode_of, room_for, run_nuts
 
 
@@ -258,6 +259,7 @@ def sample_posterior(
     completions: bool = True,
     target_accept: float = 0.9,
     max_tree_depth: int = 10,
+    progress: bool = False,
 ) -> az.InferenceData:
     """Draw from the posterior over weights and hidden steps of :func:`occlusion_model`.
 
@@ -280,6 +282,8 @@ def sample_posterior(
         Whether to draw the hidden steps too.
     target_accept, max_tree_depth
         As in NumPyro's ``NUTS``.
+    progress : bool
+        Says on standard error what is being done: finding the mode, sampling, completing.
 
     Returns
     -------
@@ -311,7 +315,32 @@ def sample_posterior(
     require_discounted(mdp)
     problem, rows = gather(mdp, sensor, demonstration, prior)
     require_possible(sensor, mdp, demonstration)
+    with told(progress) as tell:
+        idata = _sampled(
+            key, problem, rows, demonstration, draws, warmup, chains, completions, target_accept,
+            max_tree_depth, tell,
+        )  # fmt: skip
+    for attrs in (idata.attrs, idata["posterior"].attrs):
+        attrs["key"] = str(np.asarray(jax.random.key_data(key)).tolist())
+    return idata
+
+
+def _sampled(
+    key: Array,
+    problem: Problem,
+    rows: Int[np.ndarray, " n"],
+    demonstration: Demonstration,
+    draws: int,
+    warmup: int,
+    chains: int,
+    completions: bool,
+    target_accept: float,
+    max_tree_depth: int,
+    tell: Callable[[str], None],
+) -> az.InferenceData:
+    tell("posterior: finding the mode, compiling first")
     mode = posterior_mode(problem)
+    tell(f"posterior: {chains} chains of {warmup} + {draws} draws, compiling first")
     start_key, chain_key, completion_key = jax.random.split(key, 3)
     spread = 2.0 * np.linalg.cholesky(mode.covariance)
     starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
@@ -325,11 +354,13 @@ def sample_posterior(
         ],
     )
     chain = jax.tree.map(lambda x: x[:, :draws], chain)
+    tell("posterior: log-likelihoods of the draws")
     flat = chain.weights.reshape(chains * draws, -1)
     shape = (chains, draws, demonstration.n_trajectories)
     log_likelihood = _in_blocks(lambda _, w: pointwise_log_likelihood(w, problem), flat)[:, rows]
     completed = None
     if completions:
+        tell("posterior: hidden steps")
         blocks = -(-len(flat) // _BLOCK)
         keys = _split(completion_key, room_for(blocks, least=1) * _BLOCK)
         padded = np.zeros(room_for(len(rows), _FEWEST_ROWS), rows.dtype)
@@ -337,10 +368,7 @@ def sample_posterior(
         drawn = _in_blocks(lambda start, w: _complete_block(keys, start, w, problem, padded), flat)
         completed = Completions(*(x[:, : len(rows)].reshape(*shape, -1) for x in drawn))
     log_likelihood = log_likelihood.reshape(shape)
-    idata = _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
-    for attrs in (idata.attrs, idata["posterior"].attrs):
-        attrs["key"] = str(np.asarray(jax.random.key_data(key)).tolist())
-    return idata
+    return _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
 
 
 def _inference_data(

@@ -25,6 +25,7 @@ from ...models.inputs.text import shortened
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import deterministic_policy, hard_plan, policy_values, reward_of
+from .progress import told
 from .serialization import demonstration_digest
 
 if TYPE_CHECKING:
@@ -310,6 +311,7 @@ def run_sessions(
     journal: Journal | None = None,
     on_session: Callable[[Any, Report], None] | None = None,
     whole: bool | None = None,
+    progress: bool = False,
 ) -> Run:
     """Run one session per demonstration of the stream until it ends or ``stop`` says so (Definition 7).
 
@@ -330,6 +332,8 @@ def run_sessions(
         from: False, and a later one that is the session's at the same place is refused. One of another
         session is refused. A journal that does not know its demonstrations (of version 1, or committed
         without digests) is continued: False.
+    progress : bool
+        Says on standard error which session is learned; the first one waits for the compiler.
 
     Raises
     ------
@@ -358,15 +362,18 @@ def run_sessions(
         state = learner.init(key)
     reports: list[Report] = []
     unlearned = ((one, b"") for one in stream) if journal is None else _unlearned(stream, journal, whole)
-    for demonstration, digest in unlearned:
-        state, report = learner.update(state, demonstration)
-        reports.append(report)
-        if journal is not None:
-            journal.commit(state, report, demonstration=digest)
-        if on_session is not None:
-            on_session(state, report)
-        if stop is not None and stop(reports):
-            return Run(state, tuple(reports), True)
+    with told(progress) as tell:
+        for demonstration, digest in unlearned:
+            compiling = "" if reports else ", compiling first"
+            tell(f"{learner.name}: session {int(state.session) + 1}{compiling}")
+            state, report = learner.update(state, demonstration)
+            reports.append(report)
+            if journal is not None:
+                journal.commit(state, report, demonstration=digest)
+            if on_session is not None:
+                on_session(state, report)
+            if stop is not None and stop(reports):
+                return Run(state, tuple(reports), True)
     return Run(state, tuple(reports), False)
 
 
