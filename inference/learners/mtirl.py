@@ -401,7 +401,11 @@ def _program(
     if temperature == 0:
         raise ValueError("temperature must be more than zero: every trajectory would be a way of its own")
     reachable = jnp.asarray(reachable_states(mdp))
-    return MixtureProgram(mdp, reachable, strength, slack, ridge, temperature, iterations, tolerance)
+    # Of one type whatever was given: 1 and 1.0 are different programs to the compiler.
+    strength, slack, ridge, temperature = (float(x) for x in (strength, slack, ridge, temperature))
+    return MixtureProgram(
+        mdp, reachable, strength, slack, ridge, temperature, int(iterations), float(tolerance)
+    )
 
 
 _seen_whole, _seen_in_part = jax.jit(seen_whole), jax.jit(seen_in_part)

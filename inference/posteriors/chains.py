@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -50,7 +51,13 @@ class Transitions(NamedTuple):
 
 
 def run_nuts(
-    key: Array, kernel: NUTS, start: Any, constrain: Callable[[Any], Drawn], warmup: int, draws: int
+    key: Array,
+    kernel: NUTS,
+    start: Any,
+    constrain: Callable[[Any], Drawn],
+    warmup: int,
+    draws: Any,
+    room: int | None = None,
 ) -> tuple[Drawn, Transitions]:
     """Run one chain of NUTS; traceable, so that chains and replications can be mapped over.
 
@@ -66,13 +73,17 @@ def run_nuts(
         draws in ``warmup`` too, until the chain ends.
     warmup, draws : int
         Draws discarded, in which the kernel adapts, and draws kept.
+    room : int, optional
+        Makes ``draws`` a number that JAX may trace, at most ``room``: one compiled chain then serves every
+        number of draws up to it.
 
     Returns
     -------
-    drawn : as ``constrain`` returns, with a leading axis ``[draws]``
+    drawn : as ``constrain`` returns, with a leading axis ``[draws]``, or ``[room]``, filled up to ``draws``
     transitions : Transitions
     """
 
+    @jax.jit  # traced once, though the shapes of what it returns are asked for
     def advance(state: HMCState, _: None) -> tuple[HMCState, tuple[Drawn, Transitions]]:
         state = kernel.sample(state, (), {})
         return state, (
@@ -88,9 +99,27 @@ def run_nuts(
         )
 
     state = kernel.init(key, warmup, start, (), {})
+    if room is not None:
+        shapes = jax.eval_shape(advance, state, None)[1]
+        empty = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), shapes)
+
+        def keep(i: Int[Array, ""], carry: tuple) -> tuple:
+            state, kept = carry
+            state, new = advance(state, None)
+            # The first place is written in the warm-up too, and keeps the first draw after it.
+            place = jnp.maximum(i - warmup, 0)
+            return state, jax.tree.map(lambda xs, x: xs.at[place].set(x), kept, new)
+
+        return lax.fori_loop(0, warmup + draws, keep, (state, empty))[1]
     # One scan, its beginning dropped: two would each trace and compile the whole sampler.
     chain = lax.scan(advance, state, None, warmup + draws)[1]
     return jax.tree.map(lambda x: x[warmup:], chain)
+
+
+def room_for(number: int, least: int = 8) -> int:
+    """Round a size up to one of few, by a quarter at most: programs are then compiled for few shapes."""
+    step = max(2 ** (max(number - 1, 1).bit_length() - 3), 1)
+    return max(-(-number // step) * step, least)
 
 
 def in_threads(run: Callable[..., Drawn], arguments: Sequence[tuple]) -> Drawn:

@@ -8,8 +8,9 @@ gets one joint completion of the demonstration by backward sampling. Together th
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import arviz as az
 import jax
@@ -38,7 +39,8 @@ from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted, reward_of, soft_plan
 from ...version import __version__
 from ..completion.smoothing import Evidence, evidence_of, log_likelihoods
-from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
+from ..sessions.progress import told
+from .chains import Mode, Transitions, in_threads, mode_of, room_for, run_nuts
 
 
 @shown_briefly
@@ -88,7 +90,14 @@ def nuts_chain(
     Starts at unconstrained weights ``start`` with a dense ``inverse_mass``; both that matrix and the step
     size are adapted during ``warmup``.
     """
-    kernel = NUTS(
+    kernel = _kernel(problem, inverse_mass, target_accept, max_tree_depth)
+    return Chain(*run_nuts(key, kernel, start, dist.biject_to(problem.prior.support), warmup, draws))
+
+
+def _kernel(
+    problem: Problem, inverse_mass: Float[Array, "D D"], target_accept: Any, max_tree_depth: int
+) -> NUTS:
+    return NUTS(
         potential_fn=lambda z: potential(z, problem),
         dense_mass=True,
         inverse_mass_matrix=inverse_mass,
@@ -96,10 +105,30 @@ def nuts_chain(
         target_accept_prob=target_accept,
         max_tree_depth=max_tree_depth,
     )
-    return Chain(*run_nuts(key, kernel, start, dist.biject_to(problem.prior.support), warmup, draws))
 
 
 run_nuts_chain = jax.jit(nuts_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
+
+
+@partial(jax.jit, static_argnames=("warmup", "room", "max_tree_depth"))
+def _run_roomy_chain(
+    key: Array,
+    problem: Problem,
+    start: Float[Array, " D"],
+    inverse_mass: Float[Array, "D D"],
+    draws: Int[Array, ""],
+    target_accept: Float[Array, ""],
+    *,
+    warmup: int,
+    room: int,
+    max_tree_depth: int,
+) -> Chain:
+    """:func:`nuts_chain` with room for ``room`` draws, of which the first ``draws`` are made."""
+    kernel = _kernel(problem, inverse_mass, target_accept, max_tree_depth)
+    constrain = dist.biject_to(problem.prior.support)
+    return Chain(*run_nuts(key, kernel, start, constrain, warmup, draws, room))
+
+
 _potential_and_gradient = jax.jit(jax.value_and_grad(potential))
 
 
@@ -156,6 +185,39 @@ def pointwise_log_likelihood(weights: Float[Array, "D K"], problem: Problem) -> 
     return lax.map(one, weights)
 
 
+_split = jax.jit(jax.random.split, static_argnums=1)
+# Draws that are looked at in one call: one program then serves every number of draws.
+_BLOCK = 50
+_FEWEST_ROWS = 32
+# A draw of the weights takes next to no memory.
+_FEWEST_DRAWS = 512
+
+
+def _room_for_draws(draws: int) -> int:
+    return max(_FEWEST_DRAWS, 1 << (draws - 1).bit_length())
+
+
+@jax.jit
+def _complete_block(
+    keys: Array, start: Int[Array, ""], weights: Float[Array, "B K"], problem: Problem, rows: Int[Array, " n"]
+) -> Completions:
+    """:func:`complete` for a block of draws, whose keys begin at ``start``."""
+    return complete(lax.dynamic_slice_in_dim(keys, start, len(weights)), weights, problem, rows)
+
+
+def _in_blocks(function: Callable[[int, np.ndarray], Any], weights: Float[np.ndarray, "D K"]) -> Any:
+    """Call ``function`` with the number of its first draw and ``_BLOCK`` draws, until all had their turn.
+
+    The last block is filled up with copies of the last draw; results ``[D, ...]`` are joined without them.
+    """
+    blocks = []
+    for start in range(0, len(weights), _BLOCK):
+        block = weights[start : start + _BLOCK]
+        filled = np.concatenate([block, np.repeat(block[-1:], _BLOCK - len(block), axis=0)])
+        blocks.append(jax.tree.map(np.asarray, function(start, filled)))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(weights)], *blocks)
+
+
 def posterior_mode(problem: Problem) -> Mode:
     """The mode of the unconstrained density, climbed to from its origin.
 
@@ -174,15 +236,15 @@ def gather(
 ) -> tuple[Problem, Int[np.ndarray, " n"]]:
     """The posterior's problem with identical trajectories gathered, and the row each trajectory became.
 
-    Most fragments of a little-seen expert are wholly hidden, hence identical. Rows are padded to a multiple
-    of eight, so that growing demonstrations meet few shapes.
+    Most fragments of a little-seen expert are wholly hidden, hence identical. Rows are padded to one of few
+    multiples of eight, so that growing demonstrations meet few shapes.
     """
     sensor = fitting_sensor(sensor, mdp)
     codes = np.asarray(checked_demonstration(mdp, demonstration).codes)
     distinct, rows, repeats = np.unique(
         codes.reshape(len(codes), -1), axis=0, return_inverse=True, return_counts=True
     )
-    spare = -len(distinct) % 8
+    spare = -(-room_for(len(distinct)) // 8) * 8 - len(distinct)
     distinct = distinct.reshape(-1, *codes.shape[1:])
     # A row of padding has probability one, whatever the weights.
     distinct = np.concatenate([distinct, np.broadcast_to([PAD, UNKNOWN, UNKNOWN], (spare, *codes.shape[1:]))])
@@ -204,6 +266,7 @@ def sample_posterior(
     completions: bool = True,
     target_accept: float = 0.9,
     max_tree_depth: int = 10,
+    progress: bool = False,
 ) -> az.InferenceData:
     """Draw from the posterior over weights and hidden steps of :func:`occlusion_model`.
 
@@ -226,6 +289,8 @@ def sample_posterior(
         Whether to draw the hidden steps too.
     target_accept, max_tree_depth
         As in NumPyro's ``NUTS``.
+    progress : bool
+        Says on standard error what is being done: finding the mode, sampling, completing.
 
     Returns
     -------
@@ -257,29 +322,60 @@ def sample_posterior(
     require_discounted(mdp)
     problem, rows = gather(mdp, sensor, demonstration, prior)
     require_possible(sensor, mdp, demonstration)
-    mode = posterior_mode(problem)
-    start_key, chain_key, completion_key = jax.random.split(key, 3)
-    spread = 2.0 * np.linalg.cholesky(mode.covariance)
-    starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
-    run = partial(
-        run_nuts_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
-    )
-    keys = jax.random.split(chain_key, chains)
-    chain: Chain = in_threads(
-        run, [(k, problem, x, mode.covariance) for k, x in zip(keys, starts, strict=True)]
-    )
-    flat = jnp.asarray(chain.weights.reshape(chains * draws, -1))
-    shape = (chains, draws, demonstration.n_trajectories)
-    log_likelihood = np.asarray(pointwise_log_likelihood(flat, problem))[:, rows].reshape(shape)
-    completed = None
-    if completions:
-        keys = jax.random.split(completion_key, chains * draws)
-        drawn = complete(keys, flat, problem, jnp.asarray(rows))
-        completed = Completions(*(x.reshape(*shape, -1) for x in drawn))
-    idata = _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
+    with told(progress) as tell:
+        idata = _sampled(
+            key, problem, rows, demonstration, draws, warmup, chains, completions, target_accept,
+            max_tree_depth, tell,
+        )  # fmt: skip
     for attrs in (idata.attrs, idata["posterior"].attrs):
         attrs["key"] = str(np.asarray(jax.random.key_data(key)).tolist())
     return idata
+
+
+def _sampled(
+    key: Array,
+    problem: Problem,
+    rows: Int[np.ndarray, " n"],
+    demonstration: Demonstration,
+    draws: int,
+    warmup: int,
+    chains: int,
+    completions: bool,
+    target_accept: float,
+    max_tree_depth: int,
+    tell: Callable[[str], None],
+) -> az.InferenceData:
+    tell("posterior: finding the mode, compiling first")
+    mode = posterior_mode(problem)
+    tell(f"posterior: {chains} chains of {warmup} + {draws} draws, compiling first")
+    start_key, chain_key, completion_key = jax.random.split(key, 3)
+    spread = 2.0 * np.linalg.cholesky(mode.covariance)
+    starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
+    run = partial(_run_roomy_chain, warmup=warmup, room=_room_for_draws(draws), max_tree_depth=max_tree_depth)
+    keys = jax.random.split(chain_key, chains)
+    chain: Chain = in_threads(
+        run,
+        [
+            (k, problem, x, mode.covariance, draws, float(target_accept))
+            for k, x in zip(keys, starts, strict=True)
+        ],
+    )
+    chain = jax.tree.map(lambda x: x[:, :draws], chain)
+    tell("posterior: log-likelihoods of the draws")
+    flat = np.asarray(chain.weights).reshape(chains * draws, -1)
+    shape = (chains, draws, demonstration.n_trajectories)
+    log_likelihood = _in_blocks(lambda _, w: pointwise_log_likelihood(w, problem), flat)[:, rows]
+    completed = None
+    if completions:
+        tell("posterior: hidden steps")
+        blocks = -(-len(flat) // _BLOCK)
+        keys = _split(completion_key, room_for(blocks, least=1) * _BLOCK)
+        padded = np.zeros(room_for(len(rows), _FEWEST_ROWS), rows.dtype)
+        padded[: len(rows)] = rows
+        drawn = _in_blocks(lambda start, w: _complete_block(keys, start, w, problem, padded), flat)
+        completed = Completions(*(x[:, : len(rows)].reshape(*shape, -1) for x in drawn))
+    log_likelihood = log_likelihood.reshape(shape)
+    return _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
 
 
 def _inference_data(

@@ -13,6 +13,7 @@ from ...models.inputs.display import brief, brief_table, counted, joined
 from ...models.inputs.text import shortened
 from ...models.observation.demonstration import Demonstration
 from .learner import Learner, SessionInfo
+from .progress import told
 from .serialization import demonstration_digest
 from .stopping import StoppingCriterion
 
@@ -85,6 +86,7 @@ def run_sessions(
     journal: SessionStore | None = None,
     on_session: Callable[[Any, SessionInfo], None] | None = None,
     whole: bool | None = None,
+    progress: bool = False,
 ) -> Run:
     """Run one session per demonstration of the stream until it ends or ``stop`` says so (Definition 7).
 
@@ -105,6 +107,8 @@ def run_sessions(
         from: False, and a later one that is the session's at the same place is refused. One of another
         session is refused. A journal that does not know its demonstrations (of version 1, or committed
         without digests) is continued: False.
+    progress : bool
+        Print the number of each session to standard error; the first one waits for the compiler.
 
     Raises
     ------
@@ -133,15 +137,18 @@ def run_sessions(
         state = learner.init(key)
     infos: list[SessionInfo] = []
     unlearned = ((one, b"") for one in stream) if journal is None else _unlearned(stream, journal, whole)
-    for demonstration, digest in unlearned:
-        state, info = learner.update(state, demonstration)
-        infos.append(info)
-        if journal is not None:
-            journal.commit(state, info, demonstration=digest)
-        if on_session is not None:
-            on_session(state, info)
-        if stop is not None and stop(infos):
-            return Run(state, tuple(infos), True)
+    with told(progress) as tell:
+        for demonstration, digest in unlearned:
+            compiling = "" if infos else ", compiling first"
+            tell(f"{learner.name}: session {int(state.session) + 1}{compiling}")
+            state, info = learner.update(state, demonstration)
+            infos.append(info)
+            if journal is not None:
+                journal.commit(state, info, demonstration=digest)
+            if on_session is not None:
+                on_session(state, info)
+            if stop is not None and stop(infos):
+                return Run(state, tuple(infos), True)
     return Run(state, tuple(infos), False)
 
 
