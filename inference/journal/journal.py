@@ -268,10 +268,16 @@ class _Row(NamedTuple):
 
 # Type, and the most bytes of a blob. A value of another type or size is not read: NULL comes in its place.
 _COLUMNS: dict[str, tuple[str, int]] = {
-    "number": ("integer", 0), "committed": ("real", 0), "records": ("integer", 0), "digest": ("text", 0),
-    "demonstration": ("blob", 64), "state": ("blob", 64), "chain": ("blob", 64),
-    "weights": ("blob", SESSION_BYTES), "report": ("blob", SESSION_BYTES),
-}  # fmt: skip
+    "number": ("integer", 0),
+    "committed": ("real", 0),
+    "records": ("integer", 0),
+    "digest": ("text", 0),
+    "demonstration": ("blob", 64),
+    "state": ("blob", 64),
+    "chain": ("blob", 64),
+    "weights": ("blob", SESSION_BYTES),
+    "report": ("blob", SESSION_BYTES),
+}
 
 
 def _selected(columns: Iterable[str], absent: Sequence[str] = ()) -> str:
@@ -684,9 +690,7 @@ class Journal(JournalView):
                 f"{len(weights):,} and {len(told):,}"
             )
         records, digest = self.position if position is None else position
-        row = _Row(
-            session, time.time(), records, digest, demonstration, _stamp(tree), b"", weights, told
-        )  # fmt: skip
+        row = _Row(session, time.time(), records, digest, demonstration, _stamp(tree), b"", weights, told)
         row = row._replace(chain=row.linked(self._genesis, self._newest.chain))
         newest = _Newest(session, self._newest.sessions + 1, row.chain)
         kept = f"what was committed up to session {last} is safe" if last else "nothing was committed before"

@@ -79,8 +79,10 @@ def require_available_visits(mdp: TabularMDP, counts: Float[Array, "n S A"]) -> 
         return
     given, expected = np.asarray(counts), (mdp.n_states, mdp.n_actions)
     if given.ndim != 3 or given.shape[1:] != expected:
-        raise ValueError(f"visit counts must have shape [n, S, A] = [n, {expected[0]}, {expected[1]}], "
-                         f"got {list(given.shape)}")  # fmt: skip
+        raise ValueError(
+            f"visit counts must have shape [n, S, A] = [n, {expected[0]}, {expected[1]}], "
+            f"got {list(given.shape)}"
+        )
     wrong = np.argwhere((given > 0) & ~np.asarray(mdp.available))
     if len(wrong):
         i, s, a = wrong[0]

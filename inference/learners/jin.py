@@ -81,9 +81,11 @@ def reward_correction(
     # Occupancy is linear in the distribution it starts from: one solve gives both expectations' difference.
     apart = (
         jnp.zeros(mdp.n_states)
-        .at[mdp.successors[state, action]].add(mdp.probabilities[state, action])
-        .at[mdp.successors[state, predicted]].add(-mdp.probabilities[state, predicted])
-    )  # fmt: skip
+        .at[mdp.successors[state, action]]
+        .add(mdp.probabilities[state, action])
+        .at[mdp.successors[state, predicted]]
+        .add(-mdp.probabilities[state, predicted])
+    )
     later = jnp.einsum("sa,sak->k", occupancy(mdp, policy, apart), mdp.features)
     now = mdp.features[state, action] - mdp.features[state, predicted]
     return Correction(now + mdp.discount * later, predicted != action)

@@ -155,11 +155,16 @@ def lme_i2rl(
     def build(mdp: TabularMDP) -> Learner:
         method = checked_method(mdp, sensor, statistic, completion, slack, ridge, draws)
         configuration = {
-            "statistic": statistic, "completion": completion, "solver": solver, "slack": described(slack),
+            "statistic": statistic,
+            "completion": completion,
+            "solver": solver,
+            "slack": described(slack),
             "ridge": ridge,
-            "draws": draws if completion != "exact" else 0, "iterations": iterations, "tolerance": tolerance,
+            "draws": draws if completion != "exact" else 0,
+            "iterations": iterations,
+            "tolerance": tolerance,
             "sensor": digest_of(sensor),
-        }  # fmt: skip
+        }
         start = partial(_carried_on, method)
         return _learner(name, method, start, solver, iterations, tolerance, configuration)
 
@@ -177,14 +182,24 @@ def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: AnySensor, **options: 
 
     def build(mdp: TabularMDP) -> Learner:
         method = checked_method(
-            mdp, sensor, configuration["statistic"], configuration["completion"],
-            options.get("slack", DEFAULT_SLACK), configuration["ridge"], configuration["draws"],
-        )  # fmt: skip
+            mdp,
+            sensor,
+            configuration["statistic"],
+            configuration["completion"],
+            options.get("slack", DEFAULT_SLACK),
+            configuration["ridge"],
+            configuration["draws"],
+        )
         start = partial(_started_afresh, method)
         return _learner(
-            carried.name, method, start, configuration["solver"], configuration["iterations"],
-            configuration["tolerance"], configuration,
-        )  # fmt: skip
+            carried.name,
+            method,
+            start,
+            configuration["solver"],
+            configuration["iterations"],
+            configuration["tolerance"],
+            configuration,
+        )
 
     return on_scaled_features(mdp, build)
 
@@ -237,9 +252,15 @@ def _em(
             lambda: point.gradient,
         )
         return _Iterate(
-            solution.weights, solution.values, relative_change(point.weights, solution.weights), gradient,
-            point.iterations + 1, point.solver_iterations + solution.iterations, solution.converged, key,
-        )  # fmt: skip
+            solution.weights,
+            solution.values,
+            relative_change(point.weights, solution.weights),
+            gradient,
+            point.iterations + 1,
+            point.solver_iterations + solution.iterations,
+            solution.converged,
+            key,
+        )
 
     def unfinished(point: _Iterate) -> Bool[Array, ""]:
         return (point.change > tolerance) & (point.iterations < iterations)

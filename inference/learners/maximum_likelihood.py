@@ -315,9 +315,15 @@ def em_mlirl(
         # Rows of padding would count for the proportions.
         real = demonstration.lengths > 0
         mixtures, responsibilities, history = _em(
-            as_key(key), scaled, jnp.asarray(counts[real]), jnp.asarray(float(rationality)),
-            n_components, restarts, iterations, ascents,
-        )  # fmt: skip
+            as_key(key),
+            scaled,
+            jnp.asarray(counts[real]),
+            jnp.asarray(float(rationality)),
+            n_components,
+            restarts,
+            iterations,
+            ascents,
+        )
         best = int(np.argmax(history[:, -1]))
         proportions = np.asarray(responsibilities[best]).mean(0)
         rows = np.broadcast_to(proportions, (len(real), n_components)).copy()

@@ -190,11 +190,16 @@ def mme_mtirl(
             mdp, n_components, strength, temperature, slack, ridge, restarts, iterations, tolerance
         )
         configuration = {
-            "n_components": n_components, "strength": strength, "temperature": temperature, "slack": slack,
+            "n_components": n_components,
+            "strength": strength,
+            "temperature": temperature,
+            "slack": slack,
             "ridge": ridge,
-            "restarts": restarts, "iterations": iterations, "tolerance": tolerance,
+            "restarts": restarts,
+            "iterations": iterations,
+            "tolerance": tolerance,
             "sensor": digest_of(sensor),
-        }  # fmt: skip
+        }
         return _learner(program, sensor, n_components, restarts, configuration)
 
     return on_scaled_features(mdp, build)

@@ -228,20 +228,39 @@ def rimeo(
         program = ObservationProgram(psi, reportable) if solver == "ipopt" else None
         perception = entropic_perception(classes, scores, truths, errors, forgetting, program)
     configuration = {
-        "scores": scores, "truths": truths, "unscored": unscored, "solver": solver, "statistic": statistic,
-        "slack": described(slack), "ridge": ridge, "errors": errors, "forgetting": forgetting,
-        "start": np.asarray(start, float).tolist(), "iterations": iterations, "tolerance": tolerance,
-        "view": digest_of(seen), "predicates": digest_of(_half_sure(psi, reportable)),
-    }  # fmt: skip
+        "scores": scores,
+        "truths": truths,
+        "unscored": unscored,
+        "solver": solver,
+        "statistic": statistic,
+        "slack": described(slack),
+        "ridge": ridge,
+        "errors": errors,
+        "forgetting": forgetting,
+        "start": np.asarray(start, float).tolist(),
+        "iterations": iterations,
+        "tolerance": tolerance,
+        "view": digest_of(seen),
+        "predicates": digest_of(_half_sure(psi, reportable)),
+    }
     name = "RIMEO" if truths == "posterior" else f"RIMEO ({truths})"
     first_logits = initial_logits(psi, start)
 
     def build(mdp: TabularMDP) -> Learner:
         method = checked_method(mdp, seen, statistic, "exact", slack, ridge, 0)
         return _learner(
-            name, method, perception, _half_sure(psi, reportable), configuration, first_logits,
-            forgetting, iterations, tolerance, solver, scores != "none" and not unscored,
-        )  # fmt: skip
+            name,
+            method,
+            perception,
+            _half_sure(psi, reportable),
+            configuration,
+            first_logits,
+            forgetting,
+            iterations,
+            tolerance,
+            solver,
+            scores != "none" and not unscored,
+        )
 
     return on_scaled_features(mdp, build)
 
@@ -276,19 +295,33 @@ def rifom(
     ways = {"fair": counted_perception, "coded": coded_perception}
     perception = ways[form](report_classes(psi, reportable), psi)
     configuration = {
-        "form": form, "statistic": statistic, "slack": described(slack), "ridge": ridge,
+        "form": form,
+        "statistic": statistic,
+        "slack": described(slack),
+        "ridge": ridge,
         "forgetting": forgetting,
-        "iterations": iterations, "tolerance": tolerance, "view": digest_of(seen),
+        "iterations": iterations,
+        "tolerance": tolerance,
+        "view": digest_of(seen),
         "predicates": digest_of(_half_sure(psi, reportable)),
-    }  # fmt: skip
+    }
     first_logits = initial_logits(psi, DEFAULT_START)
 
     def build(mdp: TabularMDP) -> Learner:
         method = checked_method(mdp, seen, statistic, "exact", slack, ridge, 0)
         return _learner(
-            f"RIFOM ({form})", method, perception, _half_sure(psi, reportable), configuration,
-            first_logits, forgetting, iterations, tolerance, "newton", False,
-        )  # fmt: skip
+            f"RIFOM ({form})",
+            method,
+            perception,
+            _half_sure(psi, reportable),
+            configuration,
+            first_logits,
+            forgetting,
+            iterations,
+            tolerance,
+            "newton",
+            False,
+        )
 
     return on_scaled_features(mdp, build)
 
@@ -432,11 +465,16 @@ class _Alternation(NamedTuple):
         moved = jnp.max(jnp.where(jnp.isnan(agreement), 0.0, jnp.abs(agreement - point.agreement)))
         weights = jnp.asarray(solution.weights)
         return _Point(
-            weights, jnp.asarray(solution.values), logits, agreement,
-            jnp.maximum(relative_change(point.weights, weights), moved), expected.gradient,
+            weights,
+            jnp.asarray(solution.values),
+            logits,
+            agreement,
+            jnp.maximum(relative_change(point.weights, weights), moved),
+            expected.gradient,
             point.iterations + 1,
-            point.solver_iterations + solution.iterations, jnp.asarray(solution.converged),
-        )  # fmt: skip
+            point.solver_iterations + solution.iterations,
+            jnp.asarray(solution.converged),
+        )
 
     def close(
         self, state: RIMEOState, session: PreparedSession, confidence: Array, point: _Point, program: Any
@@ -516,9 +554,15 @@ def _learner(
     def init(key: Array) -> RIMEOState:
         key, fresh = jax.random.split(as_key(key))
         return RIMEOState(
-            random_weights(fresh, mdp), method.statistic.empty(mdp), jnp.zeros(mdp.n_states), first_logits,
-            perception.empty, warm, jnp.zeros((), int), key,
-        )  # fmt: skip
+            random_weights(fresh, mdp),
+            method.statistic.empty(mdp),
+            jnp.zeros(mdp.n_states),
+            first_logits,
+            perception.empty,
+            warm,
+            jnp.zeros((), int),
+            key,
+        )
 
     def update(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOInfo]:
         began = time.perf_counter()

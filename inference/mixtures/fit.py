@@ -213,10 +213,19 @@ def e_step(
     objective = objective_of(program, kept, mixture, policies, assigned)
     shares = assigned.responsibilities
     return Fit(
-        mixture, kept, shares, _collected(shares, explained.visits), _collected(shares, explained.seen),
-        assigned.log_likelihood, objective, jnp.array(-jnp.inf), objective - before, iterations,
-        solver_iterations, jnp.array(True),
-    )  # fmt: skip
+        mixture,
+        kept,
+        shares,
+        _collected(shares, explained.visits),
+        _collected(shares, explained.seen),
+        assigned.log_likelihood,
+        objective,
+        jnp.array(-jnp.inf),
+        objective - before,
+        iterations,
+        solver_iterations,
+        jnp.array(True),
+    )
 
 
 def _m_step(
@@ -273,6 +282,16 @@ def unmade(
     nowhere, zero = jnp.array(-jnp.inf), jnp.zeros((), int)
     unknown = jnp.zeros(trajectories.live.shape)
     return Fit(
-        mixture, kept, responsibilities, visits, visits, unknown, nowhere, nowhere, -nowhere, zero, zero,
+        mixture,
+        kept,
+        responsibilities,
+        visits,
+        visits,
+        unknown,
+        nowhere,
+        nowhere,
+        -nowhere,
+        zero,
+        zero,
         jnp.array(True),
-    )  # fmt: skip
+    )

@@ -393,11 +393,15 @@ def gibbs_mixture_posterior(
         concentration=concentration,
         prior=prior,
         at_least_one={
-            "components": components, "draws": draws, "chains": chains,
-            "auxiliary": auxiliary, "moves": moves, "thin": thin,
+            "components": components,
+            "draws": draws,
+            "chains": chains,
+            "auxiliary": auxiliary,
+            "moves": moves,
+            "thin": thin,
         },
         warmup=warmup,
-    )  # fmt: skip
+    )
     start_key, chain_key, break_key, resolve_key = jax.random.split(key, 4)
     reference = reference_gaussian(problem.prior)
     run = partial(_run_chain, warmup=warmup, draws=draws, auxiliary=auxiliary, moves=moves, thin=thin)

@@ -273,12 +273,16 @@ def mixture_data(
         observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},
         coords={"feature": list(problem.mdp.feature_names), "trajectory": present},
         dims={
-            "weights": ["component", "feature"], "proportions": ["component"],
-            "demonstration": ["trajectory"], "kind": steps, "state": steps, "action": steps,
+            "weights": ["component", "feature"],
+            "proportions": ["component"],
+            "demonstration": ["trajectory"],
+            "kind": steps,
+            "state": steps,
+            "action": steps,
         },
         attrs=attrs,
         posterior_attrs=attrs,
-    )  # fmt: skip
+    )
     assignment = np.asarray(resolved.assignment)
     shared = np.zeros((n, n))
     occupied = np.zeros(len(assignment), int)

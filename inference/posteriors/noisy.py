@@ -212,11 +212,17 @@ def noisy_problem(
     gathered, rows = gather(mdp, seen, demonstration, prior)
     return (
         NoisyProblem(
-            mdp, noise.predicates, noise.reportable, seen, gathered.codes, gathered.repeats, gathered.prior,
+            mdp,
+            noise.predicates,
+            noise.reportable,
+            seen,
+            gathered.codes,
+            gathered.repeats,
+            gathered.prior,
             reliabilities_prior(len(psi), reliability_prior),
         ),
         rows,
-    )  # fmt: skip
+    )
 
 
 def sample_noisy_posterior(
@@ -276,9 +282,14 @@ def sample_noisy_posterior(
         if number < least:
             raise ValueError(f"{name} must be at least {least}, got {number}")
     problem, rows = noisy_problem(
-        mdp, predicates, demonstration, view=view, reportable=reportable, prior=prior,
+        mdp,
+        predicates,
+        demonstration,
+        view=view,
+        reportable=reportable,
+        prior=prior,
         reliability_prior=reliability_prior,
-    )  # fmt: skip
+    )
     n_predicates = problem.predicates.shape[0]
     names = tuple(f"psi{j + 1}" for j in range(n_predicates)) if names is None else names
     if len(names) != n_predicates:

@@ -178,10 +178,17 @@ def birl(
     walk: Walk = jax.tree.map(
         np.asarray,
         _walk(
-            as_key(key), with_scaled_features(mdp), jnp.asarray(counts), prior,
-            jnp.asarray(float(rationality)), jnp.asarray(float(step)), chains, warmup, draws,
+            as_key(key),
+            with_scaled_features(mdp),
+            jnp.asarray(counts),
+            prior,
+            jnp.asarray(float(rationality)),
+            jnp.asarray(float(step)),
+            chains,
+            warmup,
+            draws,
         ),
-    )  # fmt: skip
+    )
     if prior is not None and not np.isfinite(walk.lp[:, -1]).all():
         raise ValueError(f"the prior {described_prior(prior)} gives no probability to weights in [-1, 1]")
     attrs = {
@@ -201,9 +208,12 @@ def birl(
         observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},
         coords={"feature": list(mdp.feature_names)},
         dims={
-            "weights": ["feature"], "demonstration": ["trajectory"],
-            "kind": steps, "state": steps, "action": steps,
+            "weights": ["feature"],
+            "demonstration": ["trajectory"],
+            "kind": steps,
+            "state": steps,
+            "action": steps,
         },
         attrs=attrs,
         posterior_attrs=attrs,
-    )  # fmt: skip
+    )

@@ -315,12 +315,15 @@ def _inference_data(
         observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},
         coords={"feature": list(mdp.feature_names)},
         dims={
-            "weights": ["feature"], "demonstration": ["trajectory"],
-            "kind": steps, "state": steps, "action": steps,
+            "weights": ["feature"],
+            "demonstration": ["trajectory"],
+            "kind": steps,
+            "state": steps,
+            "action": steps,
         },
         attrs=attrs,
         posterior_attrs=attrs,
-    )  # fmt: skip
+    )
     groups = {}
     if completions is not None:
         grid = {dim: idata.log_likelihood[dim] for dim in ("chain", "draw", "trajectory")}

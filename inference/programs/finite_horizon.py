@@ -193,9 +193,12 @@ def fit_weights(
         )
     fit = fit._replace(weights=fit.weights / scale, gap=fit.gap * scale)
     _require_matched(
-        fit, target, tolerance * scale, lambda k: f"feature {mdp.feature_names[k]!r}",
+        fit,
+        target,
+        tolerance * scale,
+        lambda k: f"feature {mdp.feature_names[k]!r}",
         partial(_feature_range, mdp, horizon),
-    )  # fmt: skip
+    )
     return fit
 
 
@@ -244,9 +247,12 @@ def fit_state_rewards(
     dual = partial(_evaluate, _state_dual, mdp.without_inflow(), target, horizon)
     fit = _lbfgs(dual, target, rewards, tolerance)
     _require_matched(
-        fit, target, np.full(mdp.n_states, tolerance), lambda s: f"state {mdp.state_names[s]!r}",
+        fit,
+        target,
+        np.full(mdp.n_states, tolerance),
+        lambda s: f"state {mdp.state_names[s]!r}",
         partial(_visits_range, mdp, horizon),
-    )  # fmt: skip
+    )
     return fit
 
 
@@ -312,9 +318,13 @@ def _lbfgs(dual: _Dual, curvature: np.ndarray, weights: np.ndarray, tolerance: f
 
     if np.abs(latest[2]).max() > tolerance:
         optimize.minimize(
-            scaled, weights * scale, jac=True, method="L-BFGS-B", callback=stop,
+            scaled,
+            weights * scale,
+            jac=True,
+            method="L-BFGS-B",
+            callback=stop,
             options={"ftol": 0.0, "gtol": 0.0, "maxiter": _MAX_EVALUATIONS, "maxfun": _MAX_EVALUATIONS},
-        )  # fmt: skip
+        )
     final, value, gap = latest
     return CausalEntropyFit(final, gap, value, evaluations)
 

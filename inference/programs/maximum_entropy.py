@@ -560,7 +560,9 @@ def require_converged(
     """
     if not bool(solution.converged):
         raise failure(
-            mdp, target, slack,
+            mdp,
+            target,
+            slack,
             f"residual {float(solution.residual):.2g} after {int(solution.iterations)} Newton iterations",
-        )  # fmt: skip
+        )
     return solution

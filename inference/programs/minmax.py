@@ -327,9 +327,14 @@ class MinMaxProgram:
             origin = jnp.zeros(self.mdp.n_states)
             values = np.stack([soft_values(self._scaled, jnp.asarray(row), origin) for row in weights])
         return MinMaxPoint(
-            proportions, np.concatenate([np.maximum(weights, 0), np.maximum(-weights, 0)], axis=1), values,
-            np.zeros(n_components), np.zeros((n_components, 2 * n_features)), np.zeros_like(values), 0.0,
-        )  # fmt: skip
+            proportions,
+            np.concatenate([np.maximum(weights, 0), np.maximum(-weights, 0)], axis=1),
+            values,
+            np.zeros(n_components),
+            np.zeros((n_components, 2 * n_features)),
+            np.zeros_like(values),
+            0.0,
+        )
 
     def _from_responsibilities(
         self, shares: np.ndarray, counts: ArrayLike, penalties: _Penalties
@@ -386,13 +391,17 @@ class MinMaxProgram:
         zero, infinite = np.zeros_like(free, float), np.full(free.shape, np.inf)
         unbounded = np.full((n_components, n_states), np.inf)
         lower = _flat(
-            np.where(held, v, 0.0), np.zeros(n_components),
-            np.concatenate([np.where(free, -np.inf, 0.0), zero], axis=1).T, -unbounded.T,
-        )  # fmt: skip
+            np.where(held, v, 0.0),
+            np.zeros(n_components),
+            np.concatenate([np.where(free, -np.inf, 0.0), zero], axis=1).T,
+            -unbounded.T,
+        )
         upper = _flat(
-            np.where(held, v, np.inf), np.full(n_components, np.inf),
-            np.concatenate([infinite, np.where(free, 0.0, np.inf)], axis=1).T, unbounded.T,
-        )  # fmt: skip
+            np.where(held, v, np.inf),
+            np.full(n_components, np.inf),
+            np.concatenate([infinite, np.where(free, 0.0, np.inf)], axis=1).T,
+            unbounded.T,
+        )
         sums, bellman = np.ones(self.trajectories + 1), np.zeros(n_components * n_states)
         loose = np.append(absent, False)
         # Stationarity in v gives the multipliers of its rows; interior v have none but the barrier's.
@@ -405,23 +414,38 @@ class MinMaxProgram:
         result = solver(
             x0=_flat(v, pi, parts.T, start.values.T),
             lam_x0=_flat(
-                np.where(held, 0.0, -_WARM_BARRIER / v), start.proportion_multipliers,
-                start.part_multipliers.T, np.zeros_like(start.values.T),
+                np.where(held, 0.0, -_WARM_BARRIER / v),
+                start.proportion_multipliers,
+                start.part_multipliers.T,
+                np.zeros_like(start.values.T),
             ),
             lam_g0=_flat(rows, np.array([start.sum_multiplier]), start.bellman_multipliers.T),
-            p=_flat(*(part for table in padded for part in table), ~absent, [strength], [temperature], slack,
-            [ridge]), lbx=lower, ubx=upper, lbg=np.concatenate([np.where(loose, -np.inf, sums), bellman]),
+            p=_flat(
+                *(part for table in padded for part in table),
+                ~absent,
+                [strength],
+                [temperature],
+                slack,
+                [ridge],
+            ),
+            lbx=lower,
+            ubx=upper,
+            lbg=np.concatenate([np.where(loose, -np.inf, sums), bellman]),
             ubg=np.concatenate([np.where(loose, np.inf, sums), bellman]),
-        )  # fmt: skip
+        )
         outcome = solver.stats()
         status = "" if outcome["success"] else str(outcome["return_status"])
         x, bounds = (self._parted(np.asarray(result[name]).ravel()) for name in ("x", "lam_x"))
         constraints = np.asarray(result["lam_g"]).ravel()
         found = MinMaxPoint(
-            x[0], x[1], x[2], bounds[0], bounds[1],
+            x[0],
+            x[1],
+            x[2],
+            bounds[0],
+            bounds[1],
             constraints[self.trajectories + 1 :].reshape(n_components, n_states),
             float(constraints[self.trajectories]),
-        )  # fmt: skip
+        )
         return self._concluded(statistics, penalties, found, int(outcome["iter_count"]), not status), status
 
     def _parted(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -453,9 +477,11 @@ class MinMaxProgram:
         pi = pi / pi.sum()
         posterior, evidence = _posterior(statistics, point.parts, values, pi, temperature)
         objective = (
-            evidence.sum() + temperature * strength * xlogy(pi, pi).sum()
-            - (np.abs(weights) @ slack).sum() - ridge / 2 * (weights**2).sum()
-        )  # fmt: skip
+            evidence.sum()
+            + temperature * strength * xlogy(pi, pi).sum()
+            - (np.abs(weights) @ slack).sum()
+            - ridge / 2 * (weights**2).sum()
+        )
         return MinMaxSolution(
             weights / self._scale, values, pi, posterior, float(objective), iterations, point
         )

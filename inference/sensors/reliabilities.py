@@ -173,9 +173,12 @@ def entropic_perception(
         if total <= 0:  # every report is scored and right: nothing is said of errors
             return jnp.zeros(classes.patterns.shape[1]), warm
         solution = program.solve(
-            plain, np.asarray(statistic.matches) / total, min(float(slack(statistic)) / total, 1.0),
-            warm if np.size(warm.variables) else None, wrong=wrong,
-        )  # fmt: skip
+            plain,
+            np.asarray(statistic.matches) / total,
+            min(float(slack(statistic)) / total, 1.0),
+            warm if np.size(warm.variables) else None,
+            wrong=wrong,
+        )
         return jnp.asarray(solution.logits), solution.warm
 
     def confidence(kept: ReportStatistic, reports: SessionReports) -> Array:
@@ -188,9 +191,16 @@ def entropic_perception(
         return jnp.where(number > 0, total / jnp.where(number > 0, number, 1.0), jnp.nan)
 
     return Perception(
-        classes, scores != "none", no_reports(classes), partial(blend, forgetting=forgetting), summarise, fit,
-        partial(agreement_of, classes), confidence, None if program is None else fit_outside,
-    )  # fmt: skip
+        classes,
+        scores != "none",
+        no_reports(classes),
+        partial(blend, forgetting=forgetting),
+        summarise,
+        fit,
+        partial(agreement_of, classes),
+        confidence,
+        None if program is None else fit_outside,
+    )
 
 
 # -- controls -----------------------------------------------------------------------------------------
@@ -234,9 +244,15 @@ def counted_perception(classes: ReportClasses, predicates: Bool[np.ndarray, "J S
         return (statistic.share * statistic.size + 1) / (statistic.size + 2)
 
     return Perception(
-        classes, True, FrequencyStatistic(jnp.zeros(()), jnp.zeros(n_predicates)), blend, summarise,
-        lambda statistic, logits: _logit(agreement(logits, statistic)), agreement, _no_confidence,
-    )  # fmt: skip
+        classes,
+        True,
+        FrequencyStatistic(jnp.zeros(()), jnp.zeros(n_predicates)),
+        blend,
+        summarise,
+        lambda statistic, logits: _logit(agreement(logits, statistic)),
+        agreement,
+        _no_confidence,
+    )
 
 
 def coded_perception(classes: ReportClasses, predicates: Bool[np.ndarray, "J S A"]) -> Perception:
@@ -262,9 +278,15 @@ def coded_perception(classes: ReportClasses, predicates: Bool[np.ndarray, "J S A
         return statistic.share
 
     return Perception(
-        classes, False, FrequencyStatistic(jnp.zeros(()), jnp.full(len(psi), 0.5)), blend, summarise,
-        lambda statistic, logits: _logit(statistic.share), agreement, _no_confidence,
-    )  # fmt: skip
+        classes,
+        False,
+        FrequencyStatistic(jnp.zeros(()), jnp.full(len(psi), 0.5)),
+        blend,
+        summarise,
+        lambda statistic, logits: _logit(statistic.share),
+        agreement,
+        _no_confidence,
+    )
 
 
 def printed_perception(
@@ -279,20 +301,25 @@ def printed_perception(
             return kept
         candidates = np.broadcast_to(available / available.sum(), (int(named.sum()), *available.shape))
         solution = solve_printed_program(
-            predicates, demonstration.state[named], demonstration.action[named],
-            demonstration.score[named], candidates,
-        )  # fmt: skip
+            predicates,
+            demonstration.state[named],
+            demonstration.action[named],
+            demonstration.score[named],
+            candidates,
+        )
         return blend(kept, FrequencyStatistic(jnp.ones(()), jnp.asarray(solution.reliabilities)))
 
     return Perception(
-        classes, False, empty,
+        classes,
+        False,
+        empty,
         lambda kept, new: kept,
         lambda logits, session, confidence, pairs: empty,
         lambda statistic, logits: _logit(statistic.share),
         lambda logits, statistic: statistic.share,
         _no_confidence,
         hear=hear,
-    )  # fmt: skip
+    )
 
 
 def _logit(p: Array) -> Array:

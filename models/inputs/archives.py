@@ -25,8 +25,19 @@ _LAST_CHARACTER = 0x10FFFF
 _MAX_PIECE = 2**17
 _ENCRYPTED = 0x1
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_WORDS = {"b": "booleans", "i": "integers", "u": "integers", "f": "real numbers", "U": "text", "S": "bytes",
-          "c": "complex numbers", "O": "objects", "V": "records", "M": "dates", "m": "durations"}  # fmt: skip
+_WORDS = {
+    "b": "booleans",
+    "i": "integers",
+    "u": "integers",
+    "f": "real numbers",
+    "U": "text",
+    "S": "bytes",
+    "c": "complex numbers",
+    "O": "objects",
+    "V": "records",
+    "M": "dates",
+    "m": "durations",
+}
 # The kinds of header: bytes of its length, and its encoding.
 _VERSIONS = {(1, 0): (2, "latin-1"), (2, 0): (4, "latin-1"), (3, 0): (4, "utf-8")}
 _FIELD = re.compile(

@@ -217,9 +217,11 @@ def _stack(rows: list[list[tuple[int, int, int, float]]]) -> Demonstration:
 
 def _padding(shape: tuple[int, ...]) -> Demonstration:
     return Demonstration(
-        np.full(shape, PAD, np.int8), np.full(shape, UNKNOWN, np.int32),
-        np.full(shape, UNKNOWN, np.int32), np.full(shape, np.nan),
-    )  # fmt: skip
+        np.full(shape, PAD, np.int8),
+        np.full(shape, UNKNOWN, np.int32),
+        np.full(shape, UNKNOWN, np.int32),
+        np.full(shape, np.nan),
+    )
 
 
 def _iterated(trajectories: Any) -> Iterator[Any]:

@@ -16,9 +16,15 @@ from .evidence import Visibility
 _ARRAYS = ("successors", "probabilities", "features", "initial", "discount", "available")
 _NAMES = ("states", "actions", "feature_names")
 _KINDS = {
-    "successors": "iu", "probabilities": "fiu", "features": "fiub", "initial": "fiu", "discount": "fiu",
-    "available": "b", "in_view": "fiub", **dict.fromkeys(_NAMES, "Uiu"),
-}  # fmt: skip
+    "successors": "iu",
+    "probabilities": "fiu",
+    "features": "fiub",
+    "initial": "fiu",
+    "discount": "fiu",
+    "available": "b",
+    "in_view": "fiub",
+    **dict.fromkeys(_NAMES, "Uiu"),
+}
 
 
 class StoredMDP(NamedTuple):

@@ -59,11 +59,17 @@ class Labels:
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=[
-        "successors", "probabilities", "features", "initial", "discount", "available",
-        "inflow_pairs", "inflow_slots",
+        "successors",
+        "probabilities",
+        "features",
+        "initial",
+        "discount",
+        "available",
+        "inflow_pairs",
+        "inflow_slots",
     ],
     meta_fields=["labels"],
-)  # fmt: skip
+)
 @dataclass(frozen=True, eq=False)
 class TabularMDP:
     """A finite MDP without a reward, ``<S, A, P, phi, gamma, p0>`` (Definition 1), as successor lists.
@@ -282,8 +288,13 @@ class TabularMDP:
             initial = initial / initial.sum()
         digest = hashlib.sha256()
         for leaf in (
-            self.successors, self.probabilities, self.features, initial, self.discount, self.available,
-        ):  # fmt: skip
+            self.successors,
+            self.probabilities,
+            self.features,
+            initial,
+            self.discount,
+            self.available,
+        ):
             array = np.ascontiguousarray(leaf)
             digest.update(f"{array.dtype}{array.shape}".encode())
             digest.update(array.tobytes())

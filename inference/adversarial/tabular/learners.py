@@ -289,12 +289,17 @@ def _learner(
         uniform = jnp.where(mdp.available, -jnp.log(jnp.sum(mdp.available, 1, keepdims=True)), -jnp.inf)
         none = None if look.learned is None else jnp.zeros(len(look.learned.chances))
         return TabularAdversarialState(
-            network, optimiser.init(network), uniform, jnp.zeros(mdp.n_states),
+            network,
+            optimiser.init(network),
+            uniform,
+            jnp.zeros(mdp.n_states),
             TransitionStatistic(
                 jnp.zeros(()), jnp.zeros(successors.shape), jnp.zeros((how.horizon, mdp.n_states))
             ),
-            () if none is None else ConfusionStatistic(none, none), jnp.zeros((), int), key,
-        )  # fmt: skip
+            () if none is None else ConfusionStatistic(none, none),
+            jnp.zeros((), int),
+            key,
+        )
 
     def session(
         state: TabularAdversarialState, demonstration: Demonstration
@@ -357,10 +362,14 @@ def _learner(
         if look.learned is not None:
             noise = fitted_confusions(look.learned, new.confusions, look.trust)
         fields: dict[str, Any] = {
-            "session": new.session, "log_likelihood": own / jnp.maximum(trajectories, 1),
-            "demonstration_log_likelihood": own, "iterations": how.iterations, "noise": noise,
-            "seconds": jnp.array(jnp.nan), "weights": new.weights,
-        }  # fmt: skip
+            "session": new.session,
+            "log_likelihood": own / jnp.maximum(trajectories, 1),
+            "demonstration_log_likelihood": own,
+            "iterations": how.iterations,
+            "noise": noise,
+            "seconds": jnp.array(jnp.nan),
+            "weights": new.weights,
+        }
         return TabularAdversarialInfo(**fields, **met._asdict())
 
     run = jax.jit(session)
