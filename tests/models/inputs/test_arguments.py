@@ -155,7 +155,7 @@ def test_imperfections_stand_for_what_they_have():
     sensor = Sensor(Visibility([1, 0, 1]), noise)
     np.testing.assert_array_equal(sensor.visibility, [1, 0, 1])
     assert isinstance(sensor.noise, ObservationModel)
-    with pytest.raises(TypeError, match=r"reading must be an ObservationModel or None; got 3"):
+    with pytest.raises(TypeError, match=r"noise must be an ObservationModel or None; got 3"):
         Sensor(None, 3)
     with pytest.raises(ValueError, match=r"one number of states .* got shapes \(2,\) and \(3,\)"):
         Visibility([1, 0]) * Visibility([1, 0, 1])

@@ -142,5 +142,5 @@ def test_bad_input_is_refused_in_its_own_terms(toy, predicates):
         density(toy, jnp.asarray(predicates), codes, reliability_prior=dist.Normal(0.0, 1.0))
     with pytest.raises(ValueError, match="observation model is about"):
         density(toy, jnp.asarray(predicates[:, :2]), codes)
-    with pytest.raises(ValueError, match="one reading"):
+    with pytest.raises(ValueError, match="one noise"):
         density(toy, jnp.asarray(predicates), codes, view=FeatureNoise(predicates, np.full(3, 0.5)))
