@@ -1,22 +1,23 @@
 """Min-max-entropy multi-task IRL (program 5.1, in its sound form) as one CasADi program with IPOPT.
 
-Each way of doing the task has a trajectory law of maximum entropy under its own feature matching; the
-mixture of these laws has proportions of little entropy. The Lagrange dual of the former is the likelihood
-of soft-optimal behaviour, and the latter is an entropic prior (:mod:`~i2rl.inference.programs.entropic`), so
-that the stationary points are those of::
+Each component has a trajectory law of maximum entropy under its own feature matching; the mixture of these
+laws has proportions of little entropy. The Lagrange dual of the former is the likelihood of soft-optimal
+behaviour, and the latter is an entropic prior (:mod:`~i2rl.inference.programs.entropic`), so that the
+stationary points are those of::
 
     maximise    sum_{i,d,s,a} v_id N_i(s, a) log pi_{theta_d}(a | s)
-                + price { sum_{i,d} v_id (log pi_d - log v_id) + strength sum_d pi_d log pi_d }
-                - l1 sum |theta| - ridge/2 sum theta^2
+                + temperature { sum_{i,d} v_id (log pi_d - log v_id) + strength sum_d pi_d log pi_d }
+                - slack sum |theta| - ridge/2 sum theta^2
     subject to  log sum_a exp(theta_d.phi(s, a) + gamma sum P(s' | s, a) V_d(s')) = V_d(s)
                 sum_d v_id = 1,  sum_d pi_d = 1,  v >= 0,  pi >= 0
 
 (the sums over ``s, a`` of trajectory ``i`` are ``theta_d.F_i - W_i.V_d``: only those are ever formed). Given
-the rest, and at ``temperature`` 1, the best ``v`` are the posterior probabilities of the ways, at which the
-maximised function is the marginal likelihood of the mixture; :mod:`~i2rl.inference.mixtures.fit` says why to
-pay less. Alternating between them, the proportions and the rewards ascends the same function; from the same
-start both mostly, but not always, end on the same of its hills. ``N_i`` is conditional on where a trajectory
-went: two ways that differ in one choice, made once, are a mixture no better than one way that tosses a coin.
+the rest, and at ``temperature`` 1, the best ``v`` are the posterior probabilities of the components, at which
+the maximised function is the marginal likelihood of the mixture; :mod:`~i2rl.inference.mixtures.fit` explains
+why a lower temperature is better. Alternating between them, the proportions and the rewards ascends the same
+function; from the same start both mostly, but not always, end in the same local maximum. ``N_i`` is
+conditional on the states of a trajectory: two components that differ in one choice, made once, are a mixture
+no better than one component that draws the choice at random.
 """
 
 from __future__ import annotations
@@ -46,10 +47,10 @@ _COLD: dict[str, Any] = {
     "show_eval_warnings": False,
     "calc_lam_p": False,
     "ipopt.tol": 1e-9,
-    # Logarithms of proportions must not be asked for below zero.
+    # Logarithms of proportions are undefined below zero.
     "ipopt.bound_relax_factor": 0.0,
 }
-# What IPOPT ends with at this tolerance: a warm start on the central path has nothing to recentre.
+# IPOPT's final barrier at this tolerance: a warm start on the central path needs no recentring.
 _WARM_BARRIER = 1e-10
 _WARM: dict[str, Any] = {
     **_COLD,
@@ -64,7 +65,7 @@ _WARM: dict[str, Any] = {
 
 
 class MinMaxPoint(NamedTuple):
-    """A primal-dual point; what does not concern single trajectories starts the next session.
+    """A primal-dual point; all but the trajectories' own part starts the next session.
 
     Fields
     ------
@@ -73,10 +74,10 @@ class MinMaxPoint(NamedTuple):
         Positive and negative parts of the scaled weights.
     values : float ``[D, S]``
     proportion_multipliers, part_multipliers : float
-        Of their bounds; ``[D]`` and ``[D, 2K]``.
+        Multipliers of their bounds; ``[D]`` and ``[D, 2K]``.
     bellman_multipliers : float ``[D, S]``
     sum_multiplier : float
-        Of the proportions' sum.
+        Multiplier of the proportions' sum.
     """
 
     proportions: Float[np.ndarray, " D"]
@@ -95,18 +96,18 @@ class MinMaxSolution(NamedTuple):
     ------
     weights : float ``[D, K]``
         Reward weights of each way.
-    values : float ``[D, S]``
+    Reward weights of each component.
         Their soft values.
     proportions : float ``[D]``
-        ``pi_d``; a component that died has one close to zero.
+        ``pi_d``; close to zero for an empty component.
     responsibilities : float ``[n, D]``
-        ``v_{d,i}``; at ``temperature`` 1 the posterior probabilities of the ways. Rows sum to one.
+        ``v_{d,i}``; at ``temperature`` 1 the posterior probabilities of the components. Rows sum to one.
     objective : float
         The maximised objective, penalties included (nats).
     iterations : int
-        Of IPOPT.
+        IPOPT's iterations.
     warm : MinMaxPoint
-        Where to start the next session from.
+        Start for the next session.
     """
 
     weights: Float[np.ndarray, "D K"]
@@ -119,7 +120,7 @@ class MinMaxSolution(NamedTuple):
 
 
 class _Statistics(NamedTuple):
-    """What the likelihood needs of every trajectory, per component: ``F [D, n, K]`` and ``W [D, n, S]``."""
+    """Statistics of each trajectory's likelihood, per component: ``F [D, n, K]`` and ``W [D, n, S]``."""
 
     features: Float[np.ndarray, "D n K"]
     state_weights: Float[np.ndarray, "D n S"]
@@ -133,7 +134,7 @@ class _Penalties(NamedTuple):
 
 
 class MinMaxProgram:
-    """The program above, built once for an MDP, ``components`` and at most so many ``trajectories``.
+    """The program above, built once for an MDP, ``components`` and at most this many ``trajectories``.
 
     Raises ``ValueError`` for discount 1, less than one component, or more components than trajectories.
     """
@@ -202,35 +203,35 @@ class MinMaxProgram:
         weights: ArrayLike | None = None,
         warm: MinMaxPoint | None = None,
     ) -> MinMaxSolution:
-        """A local maximum uphill from exactly one of three starts.
+        """Find a local maximum uphill from exactly one of three starts.
 
         Parameters
         ----------
         counts : float ``[n, S, A]`` or ``[D, n, S, A]``
-            Visits ``N_i`` of each trajectory; the latter are expected visits completed under each component
-            where steps are hidden.
+                Visits ``N_i`` of each trajectory; with ``D``, expected visits completed under each component,
+                for demonstrations with hidden steps.
         strength : float
             ``lambda`` of the entropic prior on the proportions.
         slack, ridge : float or ``[K]``, float
-            Penalties of each component's scaled weights (:mod:`~i2rl.models.process.units`), in nats in all
-            (a Laplace and a Gaussian prior).
+                Penalties of each component's scaled weights (:mod:`~i2rl.models.process.units`), in nats in
+                all (a Laplace and a Gaussian prior).
         temperature : float
-            What a nat of information of who did what costs, in nats of likelihood; more than zero.
+            Weight of a nat of the assignments' entropy, in nats of likelihood; more than zero.
         responsibilities : float ``[n, D]``
-            Start: who did what; each component begins at the best weights for its share.
+            Start: assignments; each component begins at the best weights for its share.
         weights : float ``[D, K]``
             Start: reward weights, with equal proportions.
         warm : MinMaxPoint
-            Start: the previous session's ``solution.warm``, the trajectories' own part computed anew. A
-            component that died there stays dead. Where it leads nowhere, its weights are started from, as
-            ``weights``.
+                Start: the previous session's ``solution.warm``, the trajectories' own part computed anew. An
+                empty component stays empty. If this start fails, its weights are the start, as with
+                ``weights``.
 
         Raises
         ------
         ValueError
             For visits to unavailable pairs or malformed arguments, and unless there is one start.
         ProgramNotSolved
-            When IPOPT gives up.
+            If IPOPT fails.
         """
         statistics = self._statistics(counts)
         penalties = self._penalties(strength, temperature, slack, ridge)
@@ -262,11 +263,11 @@ class MinMaxProgram:
             raise ProgramNotSolved(
                 f"the min-max-entropy program was not solved: IPOPT reports {status} after "
                 f"{solution.iterations} iterations. Visits that a deterministic policy explains have "
-                "infinite weights: an l1 or a ridge makes them finite"
+                "infinite weights: a slack or a ridge makes them finite"
             )
         return solution
 
-    # -- what is given ------------------------------------------------------------------------------------
+    # -- arguments ------------------------------------------------------------------------------------------
 
     def _statistics(self, counts: ArrayLike) -> _Statistics:
         visits = np.asarray(counts, float)
@@ -299,13 +300,13 @@ class MinMaxProgram:
         slack = np.asarray(slack, float)
         if slack.shape not in ((), (self.mdp.n_features,)):
             raise ValueError(
-                f"l1 must be a number or have shape [K] = [{self.mdp.n_features}], got {list(slack.shape)}"
+                f"slack must be a number or have shape [K] = [{self.mdp.n_features}], got {list(slack.shape)}"
             )
         for name, value in (("strength", strength), ("slack", slack), ("ridge", ridge)):
             if not (np.isfinite(value) & (np.asarray(value) >= 0)).all():
                 raise ValueError(f"{name} must be finite and not negative, got {value}")
         if not (np.isfinite(temperature) and temperature > 0):
-            raise ValueError(f"price must be finite and more than zero, got {temperature}")
+            raise ValueError(f"temperature must be finite and more than zero, got {temperature}")
         return _Penalties(
             float(strength), float(temperature), np.broadcast_to(slack, (self.mdp.n_features,)), float(ridge)
         )
@@ -317,7 +318,7 @@ class MinMaxProgram:
                 f"{name} must be finite numbers of shape {dims} = {list(shape)}, got {list(np.shape(given))}"
             )
 
-    # -- where to start -----------------------------------------------------------------------------------
+    # -- starts ---------------------------------------------------------------------------------------------
 
     def _at(
         self, weights: np.ndarray, proportions: np.ndarray, values: np.ndarray | None = None
@@ -384,8 +385,8 @@ class MinMaxProgram:
         v = np.full((self.trajectories, n_components), 1 / n_components)
         v[:n] = np.maximum(posterior, _WARM_BARRIER / 10)
         v /= v.sum(1, keepdims=True)
-        # Rows without a trajectory are held where they are. Without l1, plus and minus could grow together
-        # for nothing: plus alone is then the weight.
+        # Rows without a trajectory stay fixed. Without slack, plus and minus could grow together at no cost:
+        # plus alone is then the weight.
         held = np.broadcast_to(absent[:, None], v.shape)
         free = np.tile(slack == 0, (n_components, 1))
         zero, infinite = np.zeros_like(free, float), np.full(free.shape, np.inf)
@@ -404,7 +405,7 @@ class MinMaxProgram:
         )
         sums, bellman = np.ones(self.trajectories + 1), np.zeros(n_components * n_states)
         loose = np.append(absent, False)
-        # Stationarity in v gives the multipliers of its rows; interior v have none but the barrier's.
+        # Stationarity in v gives the multipliers of its rows; interior v have only the barrier's.
         rows = np.zeros(self.trajectories)
         rows[:n] = evidence - temperature
         parts = start.parts
@@ -449,7 +450,7 @@ class MinMaxProgram:
         return self._concluded(statistics, penalties, found, int(outcome["iter_count"]), not status), status
 
     def _parted(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Proportions, parts of weights and values in a vector of variables or of their multipliers."""
+        """Split a vector of variables or multipliers into proportions, parts of weights, and values."""
         at = self.trajectories * self.components
         sizes = np.cumsum([at, self.components, 2 * self.mdp.n_features * self.components])
         _, pi, parts, values = np.split(vector, sizes)
@@ -494,7 +495,7 @@ def _posterior(
     proportions: np.ndarray,
     temperature: float,
 ) -> tuple[Float[np.ndarray, "n D"], Float[np.ndarray, " n"]]:
-    """The best responsibilities, and what each trajectory then adds to the objective."""
+    """Return the best responsibilities, and each trajectory's resulting share of the objective."""
     plus, minus = np.split(parts, 2, axis=1)
     likelihood = np.einsum("dik,dk->id", statistics.features, plus - minus)
     likelihood -= np.einsum("dis,ds->id", statistics.state_weights, values)
@@ -505,5 +506,5 @@ def _posterior(
 
 
 def _flat(*parts: Any) -> np.ndarray:
-    """Arrays as CasADi stacks them: column by column."""
+    """Stack arrays as CasADi does: column by column."""
     return np.concatenate([np.asarray(part, float).ravel(order="F") for part in parts])

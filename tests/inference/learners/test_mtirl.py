@@ -196,10 +196,10 @@ def test_streams_whose_first_session_is_empty_learn_from_the_next(sorting):
     [
         ({"n_components": 0}, "n_components must be at least 1, got 0"),
         ({"n_components": 2.5}, "n_components must be a whole number, got 2.5"),
-        ({"temperature": 0.0}, "price must be more than zero"),
+        ({"temperature": 0.0}, "temperature must be more than zero"),
         ({"ridge": -1.0}, "ridge must be finite and not negative"),
         ({"strength": float("nan")}, "strength must be finite and not negative, got nan"),
-        ({"temperature": float("inf")}, "price must be finite"),
+        ({"temperature": float("inf")}, "temperature must be finite"),
         ({"tolerance": float("nan")}, "tolerance must be a number"),
     ],
 )
