@@ -220,10 +220,10 @@ class NoisyTraining(NamedTuple):
     batch : int, expert steps (and as many generated ones) in a step of the discriminator
     learning_rate : float, of the discriminator's Adam
     replay : int
-            Iterations whose generated steps the discriminator draws from. Their probabilities are those under
-            the current policy. The released code uses the policy of their time, for which the log-odds are
-            wrong.
-        levels : probabilities of a random action, dealt out to the environments in turn
+        Iterations whose generated steps the discriminator draws from. Their probabilities are those under
+        the current policy. The released code uses the policy of their time, for which the log-odds are
+        wrong.
+    levels : probabilities of a random action, dealt out to the environments in turn
     shown : "intended" (as released) or "executed", the action that the discriminator sees and weighs
     """
 

@@ -267,9 +267,9 @@ class SSRRInfo(NamedTuple):
     loss, held_out : float ``[members]``
         Mean squared errors of the regression: on its last batch, and on snippets held out.
     returns : float ``[iterations]``
-            Mean return, by the environment's own reward, of the episodes that the second policy finished; NaN
-            if none ended. Learning does not use it.
-        first : AdversarialInfo, noisy-AIRL's
+        Mean return, by the environment's own reward, of the episodes that the second policy finished; NaN
+        if none ended. Learning does not use it.
+    first : AdversarialInfo, noisy-AIRL's
     pairs, environment_steps : int
         Observed pairs, and steps of both policies and the ranking, in all sessions so far.
     iterations : int

@@ -41,8 +41,8 @@ class Regression(NamedTuple):
     snippets : int, drawn for each network
     shortest, longest : int, steps of a snippet
     points : int
-            States of a snippet at which the network is evaluated. A longer snippet is represented by this
-            number of states, drawn one from each of as many equal stretches: much cheaper, and noisier.
+        States of a snippet at which the network is evaluated. A longer snippet is represented by this
+        number of states, drawn one from each of as many equal stretches: much cheaper, and noisier.
     batch : int, snippets in an iteration
     iterations : int, of Adam
     learning_rate : float

@@ -168,8 +168,7 @@ def require_components(n_components: int, trajectories: int) -> None:
     """Raise ``ValueError`` if there are fewer trajectories than components."""
     if n_components > trajectories:
         raise ValueError(
-            f"{n_components} clusters were asked for, but the demonstration has {trajectories} "
-            f"{'trajectory' if trajectories == 1 else 'trajectories'}: every cluster needs at least one"
+            f"`n_components` must be at most the number of trajectories, {trajectories}; got {n_components}"
         )
 
 

@@ -163,8 +163,8 @@ def mme_mtirl(
         program (5.1). The dissertation's is 1.
     temperature : float
         Weight of a nat of the assignments' entropy, in nats of likelihood; see
-        :mod:`~i2rl.inference.mixtures.fit`. With 1 (the likelihood itself) use it for stochastic experts; a
-        lower temperature prefers several deterministic experts to one stochastic expert.
+        :mod:`~i2rl.inference.mixtures.fit`. With 0.5 (the default) the mixture prefers several deterministic
+        experts to one stochastic expert; use 1 (the likelihood itself) for stochastic experts.
     slack, ridge : float
         Rate of a Laplace and precision of a Gaussian prior on each scaled weight (nats in all, not per
         trajectory), the reward in nats that a feature adds at most (:mod:`~i2rl.models.process.units`).

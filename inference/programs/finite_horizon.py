@@ -51,8 +51,9 @@ class CausalEntropyFit(NamedTuple):
     ------
     weights : float ``[K]``
         Feature weights ``theta``, or the reward of every state (``K = S``).
-    Features of the policy minus the target; at most the tolerance everywhere, in units of the features'
-    scales.
+    gap : float ``[K]``
+        Features of the policy minus the target; at most the tolerance everywhere, in units of the features'
+        scales.
     value : float
         The dual ``D(theta)``; at the optimum, the (discounted) causal entropy of the policy, in nats.
     evaluations : int

@@ -95,8 +95,8 @@ class MinMaxSolution(NamedTuple):
     Fields
     ------
     weights : float ``[D, K]``
-        Reward weights of each way.
-    Reward weights of each component.
+        Reward weights of each component.
+    values : float ``[D, S]``
         Their soft values.
     proportions : float ``[D]``
         ``pi_d``; close to zero for an empty component.
@@ -208,13 +208,13 @@ class MinMaxProgram:
         Parameters
         ----------
         counts : float ``[n, S, A]`` or ``[D, n, S, A]``
-                Visits ``N_i`` of each trajectory; with ``D``, expected visits completed under each component,
-                for demonstrations with hidden steps.
+            Visits ``N_i`` of each trajectory; with ``D``, expected visits completed under each component,
+            for demonstrations with hidden steps.
         strength : float
             ``lambda`` of the entropic prior on the proportions.
         slack, ridge : float or ``[K]``, float
-                Penalties of each component's scaled weights (:mod:`~i2rl.models.process.units`), in nats in
-                all (a Laplace and a Gaussian prior).
+            Penalties of each component's scaled weights (:mod:`~i2rl.models.process.units`), in nats in
+            all (a Laplace and a Gaussian prior).
         temperature : float
             Weight of a nat of the assignments' entropy, in nats of likelihood; more than zero.
         responsibilities : float ``[n, D]``
@@ -222,9 +222,9 @@ class MinMaxProgram:
         weights : float ``[D, K]``
             Start: reward weights, with equal proportions.
         warm : MinMaxPoint
-                Start: the previous session's ``solution.warm``, the trajectories' own part computed anew. An
-                empty component stays empty. If this start fails, its weights are the start, as with
-                ``weights``.
+            Start: the previous session's ``solution.warm``, the trajectories' own part computed anew. An
+            empty component stays empty. If this start fails, its weights are the start, as with
+            ``weights``.
 
         Raises
         ------

@@ -295,15 +295,15 @@ class ObservationProgram:
         weights : float ``[S, A]``
             Probability of each truth; normalised here, together with ``wrong``.
         target : float ``[J]``
-                Expected agreement on each predicate, in [0, 1]: matches of plain and of wrong observations,
-                divided by the number of both. For predicates that are not identified apart, contradictory
-                targets (two numbers for equal predicates) are replaced by the nearest consistent ones.
+            Expected agreement on each predicate, in [0, 1]: matches of plain and of wrong observations,
+            divided by the number of both. For predicates that are not identified apart, contradictory
+            targets (two numbers for equal predicates) are replaced by the nearest consistent ones.
         slack : float or float ``[J]``
             Largest distance of the agreement from its target.
         warm : IpoptPoint, optional
         wrong : float ``[S, A]``, optional
-                Probability of each truth among wrong observations with a score, on one scale with
-                ``weights``. Either may be all zero.
+            Probability of each truth among wrong observations with a score, on one scale with
+            ``weights``. Either may be all zero.
 
         Raises
         ------

@@ -39,7 +39,6 @@ def save_mdp(path: str | os.PathLike[str], mdp: TabularMDP, in_view: np.ndarray 
 
     The arrays ``successors``, ``probabilities`` (``[S, A, B]``), ``features`` ``[S, A, K]``, ``initial``
     ``[S]``, ``discount`` and ``available`` ``[S, A]`` are those of :meth:`TabularMDP.from_successors`;
-    ``[S]``, ``discount`` and ``available`` ``[S, A]`` are those of :meth:`TabularMDP.from_successors`;
     ``states``, ``actions`` and ``feature_names`` hold names if there are any. Raises ``ValueError`` for a
     path that does not end in ``.npz`` (NumPy would add it), visibility of the wrong shape or outside [0, 1],
     and names that end in a NUL character (NumPy would drop it).
