@@ -83,6 +83,14 @@ def test_mixtures_with_other_options_compile_nothing(random_mdp, imperfect_demon
     mdp, sensor, first = perceived(random_mdp, imperfect_demonstration, 0, 20)
     *_, second = perceived(random_mdp, imperfect_demonstration, 1, 20)
     batch_mme_mtirl(mdp, sensor, n_components=2).fit(jax.random.key(0), first)
-    options = {"temperature": 1, "slack": 1, "ridge": 0, "restarts": 2, "iterations": 9, "tolerance": 1, "strength": 2}
+    options = {
+        "temperature": 1,
+        "slack": 1,
+        "ridge": 0,
+        "restarts": 2,
+        "iterations": 9,
+        "tolerance": 1,
+        "strength": 2,
+    }
     other = batch_mme_mtirl(mdp, sensor, n_components=2, **options)
     assert compilations(lambda: other.fit(jax.random.key(1), second).weights) == 0

@@ -1,8 +1,8 @@
 """The posterior over reward weights and hidden steps, as ArviZ ``InferenceData``.
 
-NUTS moves in the weights alone, with the hidden steps summed out exactly; then each draw of the weights
-gets one joint completion of the demonstration by backward sampling. Together they are draws from
-``P(theta, hidden steps | what was perceived)``.
+NUTS moves in the weights alone, with the hidden steps summed out exactly; then backward sampling gives each
+draw of the weights one joint completion of the demonstration. Together they are draws from
+``P(theta, hidden steps | observations)``.
 """
 
 from __future__ import annotations
@@ -56,19 +56,19 @@ class Problem(NamedTuple):
 
 @shown_briefly
 class Chain(NamedTuple):
-    """One chain of NUTS: ``weights [draws, K]`` and what the sampler did."""
+    """One chain of NUTS: ``weights [draws, K]`` and the sampler's statistics."""
 
     weights: Float[Array, "draws K"]
     transitions: Transitions
 
     @property
     def diverging(self) -> Bool[Array, " draws"]:
-        """Of the transitions, ``[draws]``."""
+        """Marks of divergent transitions, ``[draws]``."""
         return self.transitions.diverging
 
 
 def potential(position: Float[Array, " D"], problem: Problem) -> Float[Array, ""]:
-    """Negative log-density of the declared model at unconstrained weights."""
+    """Return the negative log-density of the declared model at unconstrained weights."""
     mdp, sensor, codes, repeats, prior = problem
     options = {"prior": prior, "repeats": repeats}
     return potential_energy(occlusion_model, (mdp, sensor, codes), options, {"weights": position})
@@ -87,7 +87,7 @@ def nuts_chain(
 ) -> Chain:
     """Run one chain of NUTS; traceable, so that chains and replications can be mapped over.
 
-    Starts at unconstrained weights ``start`` with a dense ``inverse_mass``; both that matrix and the step
+    It starts at unconstrained weights ``start`` with a dense ``inverse_mass``; both that matrix and the step
     size are adapted during ``warmup``.
     """
     kernel = _kernel(problem, inverse_mass, target_accept, max_tree_depth)
@@ -145,7 +145,7 @@ class Completions(NamedTuple):
 
 def _evidence(problem: Problem) -> Evidence:
     kind, state, action = (problem.codes[..., i] for i in range(3))
-    # Scores are not part of the declared model's event, so completions do not hear of them either.
+    # Scores are not part of the declared model's event, so completions ignore them too.
     demonstration = Demonstration(kind, state, action, jnp.full(kind.shape, jnp.nan))  # type: ignore[arg-type]
     return evidence_of(problem.mdp, problem.sensor, demonstration)
 
@@ -175,7 +175,7 @@ def complete(
 
 @jax.jit
 def pointwise_log_likelihood(weights: Float[Array, "D K"], problem: Problem) -> Float[Array, "D u"]:
-    """Log-likelihood of each distinct trajectory under every draw of the weights."""
+    """Return the log-likelihood of each distinct trajectory under every draw of the weights."""
     evidence = _evidence(problem)
 
     def one(theta: Float[Array, " K"]) -> Float[Array, " u"]:
@@ -219,9 +219,9 @@ def _in_blocks(function: Callable[[int, np.ndarray], Any], weights: Float[np.nda
 
 
 def posterior_mode(problem: Problem) -> Mode:
-    """The mode of the unconstrained density, climbed to from its origin.
+    """Climb from the origin to the mode of the unconstrained density.
 
-    The dissertation's estimate, were the prior flat; here only a place to start from.
+    With a flat prior it is the dissertation's estimate; here it is only a start.
     """
 
     size = dist.biject_to(problem.prior.support).inverse_shape(problem.prior.event_shape)
@@ -234,10 +234,10 @@ def gather(
     demonstration: Demonstration,
     prior: dist.Distribution | None = None,
 ) -> tuple[Problem, Int[np.ndarray, " n"]]:
-    """The posterior's problem with identical trajectories gathered, and the row each trajectory became.
+    """Gather identical trajectories into the posterior's problem, and return the row of each.
 
-    Most fragments of a little-seen expert are wholly hidden, hence identical. Rows are padded to one of few
-    multiples of eight, so that growing demonstrations meet few shapes.
+    Most fragments of a rarely seen expert are wholly hidden, hence identical. Rows are padded to a multiple
+    of eight, so that growing demonstrations have few shapes.
     """
     sensor = fitting_sensor(sensor, mdp)
     codes = np.asarray(checked_demonstration(mdp, demonstration).codes)
@@ -277,16 +277,16 @@ def sample_posterior(
     ----------
     key : JAX random key
     mdp, sensor, demonstration
-        The decision process, how it was perceived, and what was perceived. Scores play no part.
+        The decision process, its sensor, and the observations. Scores are ignored.
     prior : numpyro.distributions.Distribution, optional
-        Over ``K`` scaled weights (:mod:`~i2rl.models.process.units`), or over one and taken for each;
-        ``Normal(0, 2.5)`` by default, see :func:`~i2rl.models.weights_prior`. An expert who never errs is
-        fitted ever better by ever larger weights: it is the prior that ends this, and the weights' common
-        length depends on it.
+        Over ``K`` scaled weights (:mod:`~i2rl.models.process.units`), or over one and used for each;
+        ``Normal(0, 2.5)`` by default, see :func:`~i2rl.models.weights_prior`. Larger weights always fit an
+        expert without errors better: the prior alone limits them, and the weights' common length depends on
+        it.
     draws, warmup, chains : int
-        Draws kept and discarded by each chain, and number of chains.
+        Draws returned and discarded by each chain, and number of chains.
     completions : bool
-        Whether to draw the hidden steps too.
+        True to draw the hidden steps too.
     target_accept, max_tree_depth
         As in NumPyro's ``NUTS``.
     progress : bool
@@ -297,18 +297,18 @@ def sample_posterior(
     arviz.InferenceData
         ``posterior``: ``weights (chain, draw, feature)``.
         ``completions``: ``state``, ``action (chain, draw, trajectory, step)``, integer indices, -1 beyond a
-        trajectory's end; the draw of the hidden steps that belongs to the posterior's draw of the weights.
-        A group of its own, so that ``az.summary``, ``az.rhat`` and ``az.plot_trace`` are about weights.
-        ``log_likelihood``: ``demonstration (chain, draw, trajectory)``, for ``az.loo`` and ``az.compare``.
-        ``sample_stats``: ``lp``, ``energy``, ``acceptance_rate``, ``step_size``, ``n_steps``,
-        ``tree_depth``, ``reached_max_treedepth``, ``diverging``.
-        ``observed_data``: ``kind``, ``state``, ``action (trajectory, step)``.
-        ``constant_data``: ``state_name``, ``action_name``, which the indices refer to.
+        trajectory's end; each draw of the hidden steps belongs to one posterior draw of the weights. They
+        have their own group, so that ``az.summary``, ``az.rhat`` and ``az.plot_trace`` cover the weights
+        alone. ``log_likelihood``: ``demonstration (chain, draw, trajectory)``, for ``az.loo`` and
+        ``az.compare``. ``sample_stats``: ``lp``, ``energy``, ``acceptance_rate``, ``step_size``, ``n_steps``,
+        ``tree_depth``, ``reached_max_treedepth``, ``diverging``. ``observed_data``: ``kind``, ``state``,
+        ``action (trajectory, step)``. ``constant_data``: ``state_name``, ``action_name``, the names of the
+        indices.
 
     Raises
     ------
     DemonstrationError
-        Naming trajectory and step, if the MDP and the sensor rule an observation out.
+        Naming trajectory and step, if an observation is impossible under the MDP and the sensor.
     ValueError
         For an empty demonstration, a prior of another shape, numbers of draws or chains below one, or an
         undiscounted MDP.
@@ -415,12 +415,15 @@ def _inference_data(
         observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},
         coords={"feature": list(mdp.feature_names)},
         dims={
-            "weights": ["feature"], "demonstration": ["trajectory"],
-            "kind": steps, "state": steps, "action": steps,
+            "weights": ["feature"],
+            "demonstration": ["trajectory"],
+            "kind": steps,
+            "state": steps,
+            "action": steps,
         },
         attrs=attrs,
         posterior_attrs=attrs,
-    )  # fmt: skip
+    )
     groups = {}
     if completions is not None:
         grid = {dim: idata.log_likelihood[dim] for dim in ("chain", "draw", "trajectory")}
@@ -450,7 +453,7 @@ def fingerprint(tree: object) -> str:
 
 
 def described_prior(prior: dist.Distribution) -> str:
-    """A distribution with its parameters, through the wrappers that only shape it."""
+    """Describe a distribution with its parameters, through the wrappers that only shape it."""
     if isinstance(prior, ScaledPrior):
         scale, base = np.asarray(prior.scale), described_prior(prior.base)
         return base if (scale == 1).all() else f"{base} on weights times {scale.tolist()}"
