@@ -494,7 +494,7 @@ def test_an_interrupted_learner_says_what_is_safe_and_goes_on_when_run_again(hou
 def test_an_interrupt_that_python_swallows_comes_again():
     script = """
 import gc, sys, time
-from i2rl.analysis import cli
+from i2rl.analysis.command import app as cli
 
 def collecting(phase, info):  # JAX has such a callback, and Python goes on when Ctrl-C hits it
     gc.callbacks.remove(collecting)
