@@ -24,10 +24,10 @@ def seconds(action: Callable[[], Any]) -> float:
     return time.perf_counter() - began
 
 
-def median_seconds(action: Callable[[], Any], runs: int = 5) -> float:
+def median_seconds(action: Callable[[], Any], replications: int = 5) -> float:
     """Median over several calls, after one that compiles."""
     action()
-    return float(np.median([seconds(action) for _ in range(runs)]))
+    return float(np.median([seconds(action) for _ in range(replications)]))
 
 
 def machine() -> dict[str, Any]:

@@ -124,18 +124,19 @@ DIMINISHING = Assumption(
 )
 SOLVED = Assumption("solved", "the maximum-entropy program was solved within its slack")
 COMPLETION = Assumption(
-    "completion", "completed features are within epsilon_s of the fully observed ones as often as sampled "
+    "completion",
+    "completed features are within epsilon_s of the fully observed ones as often as sampled "
     "means are (Hoeffding, n_s draws)",
-)  # fmt: skip
+)
 OBSERVATION = Assumption(
-    "observation", "the estimated observation model is within epsilon_o of the true one as often as a mean "
-    "of n_o values is",
-)  # fmt: skip
+    "observation",
+    "the estimated observation model is within epsilon_o of the true one as often as a mean of n_o values is",
+)
 PREDICATES_SEEN = Assumption("predicates_seen", "every predicate is observed in the first session")
 INDEPENDENT_PREDICATES = Assumption(
-    "independent_predicates", "every predicate is reported rightly or wrongly by itself, with one "
-    "probability at every pair and step",
-)  # fmt: skip
+    "independent_predicates",
+    "every predicate is reported rightly or wrongly by itself, with one probability at every pair and step",
+)
 KNOWN_TRUTHS = Assumption(
     "known_truths", "reliabilities were counted on n_o independent reports whose truth was known"
 )

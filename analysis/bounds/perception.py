@@ -269,11 +269,15 @@ def rimeo_no_regret(
             f"{len(i)} session sizes, but {len(draws)} numbers of samples and {len(reports)} of reports"
         )
     epsilon_o = third / (longest * predicates)
-    delta = 2 * n_features * (
-        np.exp(-2 * np.cumsum(counted_sessions(session_sizes)) * third**2)
-        + np.exp(-2 * draws * third**2)
-        + predicates * np.exp(-2 * np.cumsum(reports) * epsilon_o**2)
-    )  # fmt: skip
+    delta = (
+        2
+        * n_features
+        * (
+            np.exp(-2 * np.cumsum(counted_sessions(session_sizes)) * third**2)
+            + np.exp(-2 * draws * third**2)
+            + predicates * np.exp(-2 * np.cumsum(reports) * epsilon_o**2)
+        )
+    )
     confidence = np.cumprod(np.maximum(0.0, 1 - delta))
     bound = plain.bound._replace(
         source="Theorem 7 of appendix E",

@@ -208,7 +208,7 @@ def last_confident_session(c: float, session_size: int, n_features: int, discoun
 
 
 class RegretCurve(NamedTuple):
-    """One threshold's runs: expected and empirical average regret ``[R, T]``, and its name."""
+    """One threshold's replications: expected and empirical average regret ``[R, T]``, and its name."""
 
     name: str
     expected: Float[np.ndarray, "R T"]
@@ -234,9 +234,9 @@ def regret_plot(
 ) -> Figure:
     """Average regret against sessions: expected, on log-log axes with fitted slopes, and empirical.
 
-    Lines are medians over runs, bands hold ``coverage`` of them; the slope is that of the mean over runs.
-    ``theorem`` is drawn with the expected form, ``sure`` bounds, by the name of their curve, with the other.
-    Raises ``ValueError`` for curves of different lengths.
+    Lines are medians over replications, bands hold ``coverage`` of them; the slope is that of the mean over
+    replications. ``theorem`` is drawn with the expected form, ``sure`` bounds, by the name of their curve,
+    with the other. Raises ``ValueError`` for curves of different lengths.
     """
     bounds = {} if sure is None else sure
     lengths = {np.shape(c.expected)[-1] for c in curves} | {len(bound) for bound in bounds.values()}
@@ -273,12 +273,13 @@ def regret_plot(
     _label(left, theme, "Expected: excess risk, never negative")
     _label(right, theme, "Empirical: on the learner's own data")
     head(figure, theme, handles + surely, title=title, columns=3)
-    runs = np.shape(curves[0].expected)[0]
+    replications = np.shape(curves[0].expected)[0]
     foot(
-        figure, theme,
-        f"lines: medians of {counted(runs, 'stream')}; bands: central {coverage:.0%}; "
+        figure,
+        theme,
+        f"lines: medians of {counted(replications, 'stream')}; bands: central {coverage:.0%}; "
         f"slopes: least squares of the mean over every T from {burn_in} on",
-    )  # fmt: skip
+    )
     return figure
 
 

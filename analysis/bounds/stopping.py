@@ -90,11 +90,11 @@ def _first(fires: Bool[np.ndarray, "R n"], earliest: int) -> Int[np.ndarray, " R
 
 
 class Verdict(NamedTuple):
-    """A rule's stops over ``runs`` streams of ``sessions`` sessions.
+    """A rule's stops over ``replications`` streams of ``sessions`` sessions.
 
     Fields
     ------
-    false_stops, stops, runs : int
+    false_stops, stops, replications : int
     used : int ``[R]``
         Sessions each stream ran for: all where the rule never fired.
     sessions : int
@@ -104,7 +104,7 @@ class Verdict(NamedTuple):
 
     false_stops: int
     stops: int
-    runs: int
+    replications: int
     used: Int[np.ndarray, " R"]
     sessions: int
     loss: float
@@ -112,7 +112,7 @@ class Verdict(NamedTuple):
     @property
     def false_rate(self) -> float:
         """Share of all streams that were stopped too soon."""
-        return self.false_stops / self.runs
+        return self.false_stops / self.replications
 
     @property
     def saved(self) -> float:
@@ -121,7 +121,7 @@ class Verdict(NamedTuple):
 
     def interval(self, confidence: float = 0.95) -> tuple[float, float]:
         """Wilson interval of the false-stop rate."""
-        interval = binomtest(self.false_stops, self.runs).proportion_ci(confidence, "wilson")
+        interval = binomtest(self.false_stops, self.replications).proportion_ci(confidence, "wilson")
         return float(interval.low), float(interval.high)
 
 
@@ -133,10 +133,10 @@ def judge_stops(
     Raises ``ValueError`` for stops that do not fit the streams, a negative margin or a tail of no session.
     """
     stops, accuracy = np.asarray(stops), np.asarray(accuracy, float)
-    runs, sessions = accuracy.shape
-    if stops.shape != (runs,) or stops.min() < 0 or stops.max() > sessions:
+    replications, sessions = accuracy.shape
+    if stops.shape != (replications,) or stops.min() < 0 or stops.max() > sessions:
         raise ValueError(
-            f"stops must be {runs} sessions from 0 (never) to {sessions}, got shape {stops.shape} "
+            f"stops must be {replications} sessions from 0 (never) to {sessions}, got shape {stops.shape} "
             f"from {stops.min()} to {stops.max()}"
         )
     if margin < 0 or not 1 <= tail <= sessions:
@@ -146,10 +146,15 @@ def judge_stops(
     settled = accuracy[:, -tail:].mean(1)
     stopped = stops != NEVER
     used = np.where(stopped, stops, sessions)
-    missing = settled - accuracy[np.arange(runs), used - 1]
+    missing = settled - accuracy[np.arange(replications), used - 1]
     false = stopped & (missing > margin)
     return Verdict(
-        int(false.sum()), int(stopped.sum()), runs, used, sessions, float(missing[stopped].sum() / runs)
+        int(false.sum()),
+        int(stopped.sum()),
+        replications,
+        used,
+        sessions,
+        float(missing[stopped].sum() / replications),
     )
 
 

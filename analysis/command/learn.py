@@ -19,7 +19,9 @@ if TYPE_CHECKING:
 
 def learn_online(
     mdp: Annotated[str, typer.Option(help="patrol1, patrol2, patrol3, labyrinth, or an MDP.npz file.")],
-    demos: Annotated[str, typer.Option(help="JSON Lines file of trajectories, or - for standard input.")],
+    demonstrations: Annotated[
+        str, typer.Option(help="JSON Lines file of trajectories, or - for standard input.")
+    ],
     journal: Annotated[
         Path, typer.Option(help="SQLite file that keeps every session; resumed if it exists.")
     ],
@@ -64,9 +66,13 @@ def learn_online(
     with reported_errors():
         process, sensor = _decision_process(mdp, observability)
         learner = lme_i2rl(
-            process, sensor, statistic=statistic, solver=solver, ridge=ridge,
+            process,
+            sensor,
+            statistic=statistic,
+            solver=solver,
+            ridge=ridge,
             slack=DEFAULT_SLACK if slack is None else slack,
-        )  # fmt: skip
+        )
         # Another agent is another expert, and other sessions are another history: a journal of one must
         # not go on with the other.
         stream = ({} if agent is None else {"agent": agent}) | (
@@ -75,8 +81,10 @@ def learn_online(
         learner = learner._replace(configuration={**learner.configuration, **stream})
         limits = LineLimits(line_bytes, line_steps)
         if quarantine is not None:
-            require_apart("--quarantine", quarantine, demos, *journal_files(journal))
-        lines, source = open_lines(demos, follow, limits, skip=quarantine is not None, say=print_message)
+            require_apart("--quarantine", quarantine, demonstrations, *journal_files(journal))
+        lines, source = open_lines(
+            demonstrations, follow, limits, skip=quarantine is not None, say=print_message
+        )
         with Journal.open(journal, learner) as opened, progress(as_json) as advance:
             before = opened.session
             aside = None if quarantine is None else Quarantine(quarantine)
@@ -88,15 +96,25 @@ def learn_online(
 
             try:
                 done = learn_stream(
-                    learner, lines, opened, jax.random.key(seed), size=session_size, agent=agent,
-                    source=source, on_session=report_session, limits=limits, quarantine=aside,
-                )  # fmt: skip
+                    learner,
+                    lines,
+                    opened,
+                    jax.random.key(seed),
+                    size=session_size,
+                    agent=agent,
+                    source=source,
+                    on_session=report_session,
+                    limits=limits,
+                    quarantine=aside,
+                )
             except KeyboardInterrupt:
                 print_message(f"Interrupted; {opened.session} sessions are in {journal}. Run again to go on.")
                 raise typer.Exit(130) from None
             except BrokenPipeError:
-                print_message(f"The output's reader went away; {opened.session} sessions are in {journal}. "
-                     "Run again to go on.")  # fmt: skip
+                print_message(
+                    f"The output's reader went away; {opened.session} sessions are in {journal}. "
+                    "Run again to go on."
+                )
                 raise
             if aside is not None:
                 counts = f"{aside.added} new, {aside.lines} in all"

@@ -61,9 +61,9 @@ def run_patrol(
     sessions: Annotated[int, count_option("Sessions of five steps a patroller.")] = 60,
     method: Annotated[Method, typer.Option(help="Which learners to run.")] = Method.all,
     trials: Annotated[int, count_option("Simulated breaches per learned policy.")] = 200,
-    runs: Annotated[int, count_option("Independent repetitions.")] = 3,
+    replications: Annotated[int, count_option("Independent repetitions.")] = 3,
     seed: Seed = 0,
-    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report"),
+    folder: Annotated[Path, typer.Option(help="Folder of the page and its results.")] = Path("report"),
     as_json: Json = False,
 ) -> None:
     """Watch patrollers through a keyhole, learn their reward online, and walk past them unseen."""
@@ -71,11 +71,17 @@ def run_patrol(
 
     with reported_errors(), progress(as_json) as advance:
         study = patrol_study.patrol_study(
-            instance, observability, sessions=sessions, trials=trials, runs=runs, seed=seed,
-            methods=None if method is Method.all else (method.value,), advance=advance,
-        )  # fmt: skip
-        patrol_study.write(study, report)
-    print_results(patrol_study, study, report, as_json)
+            instance,
+            observability,
+            sessions=sessions,
+            trials=trials,
+            replications=replications,
+            seed=seed,
+            methods=None if method is Method.all else (method.value,),
+            advance=advance,
+        )
+        patrol_study.write(study, folder)
+    print_results(patrol_study, study, folder, as_json)
 
 
 @commands.command("labyrinth")
@@ -88,7 +94,9 @@ def run_labyrinth(
     ] = True,
     discount: Annotated[float | None, real_option("Discount of the animal's future.", 0, 1)] = None,
     ridge: Annotated[float | None, real_option("Precision of the weights' Gaussian prior.", 0)] = None,
-    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-labyrinth"),
+    folder: Annotated[Path, typer.Option(help="Folder of the page and its results.")] = Path(
+        "report-labyrinth"
+    ),
     as_json: Json = False,
 ) -> None:
     """Learn a mouse's reward in a labyrinth, bout by bout, each bout predicted before it is learned from."""
@@ -100,22 +108,26 @@ def run_labyrinth(
         with recording.open("rb") as lines:
             bouts = list(read_bouts(lines, recording.name))
         study = labyrinth.labyrinth_study(
-            bouts, recording=recording.stem, hide_left=hide_left,
+            bouts,
+            recording=recording.stem,
+            hide_left=hide_left,
             discount=labyrinth.DISCOUNT if discount is None else discount,
             ridge=labyrinth.RIDGE if ridge is None else ridge,
             on_bout=lambda view, number, bits: advance(f"{view}: bout {number}, {bits:.3f} bits", None),
-        )  # fmt: skip
-        labyrinth_page.write(study, report)
-    print_results(labyrinth_page, study, report, as_json)
+        )
+        labyrinth_page.write(study, folder)
+    print_results(labyrinth_page, study, folder, as_json)
 
 
 @commands.command("methods")
 def run_methods(
     instance: Instance = 2,
     sessions: Annotated[int, count_option("Sessions of five steps a patroller.")] = 120,
-    runs: Annotated[int, count_option("Independent repetitions.")] = 3,
+    replications: Annotated[int, count_option("Independent repetitions.")] = 3,
     seed: Seed = 0,
-    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-methods"),
+    folder: Annotated[Path, typer.Option(help="Folder of the page and its results.")] = Path(
+        "report-methods"
+    ),
     as_json: Json = False,
 ) -> None:
     """Compare online methods on a patrol in full view: how many pairs does each need, what does it keep?"""
@@ -123,10 +135,10 @@ def run_methods(
 
     with reported_errors(), progress(as_json) as advance:
         study = online_methods.methods_study(
-            instance, sessions=sessions, runs=runs, seed=seed, advance=advance
+            instance, sessions=sessions, replications=replications, seed=seed, advance=advance
         )
-        online_methods.write(study, report)
-    print_results(online_methods, study, report, as_json)
+        online_methods.write(study, folder)
+    print_results(online_methods, study, folder, as_json)
 
 
 @commands.command("label-bias")
@@ -135,17 +147,19 @@ def run_label_bias(
     trajectories: Annotated[int, count_option("Expert trajectories a world.", 4)] = 75,
     walls: Annotated[int, count_option("Walls a world, of 100 cells.", 0)] = 25,
     seed: Seed = 0,
-    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-label-bias"),
+    folder: Annotated[Path, typer.Option(help="Folder of the page and its results.")] = Path(
+        "report-label-bias"
+    ),
     as_json: Json = False,
 ) -> None:
     """Does a likelier trajectory earn more? Table 5.1, in many Object Worlds and under many assumptions."""
-    from ..studies.label_bias import page as label_bias_report
+    from ..studies.label_bias import page as label_bias_page
     from ..studies.label_bias import study as label_bias
 
     with reported_errors(), progress(as_json) as advance:
         study = label_bias.label_bias_study(worlds, trajectories, walls=walls, seed=seed, advance=advance)
-        label_bias_report.write(study, report)
-    print_results(label_bias_report, study, report, as_json)
+        label_bias_page.write(study, folder)
+    print_results(label_bias_page, study, folder, as_json)
 
 
 @commands.command("sorting")
@@ -165,39 +179,50 @@ def run_sorting(
     ] = None,
     n_components: Annotated[int, count_option("Ways that MME-MTIRL starts from: the most it can find.")] = 4,
     steps: Annotated[int, count_option("Steps of a trajectory.")] = 50,
-    runs: Annotated[int, count_option("Independent repetitions.")] = 3,
+    replications: Annotated[int, count_option("Independent repetitions.")] = 3,
     belts: Annotated[int, count_option("Simulated belts of Table 7.2.")] = 300,
     seed: Seed = 0,
-    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-sorting"),
+    folder: Annotated[Path, typer.Option(help="Folder of the page and its results.")] = Path(
+        "report-sorting"
+    ),
     as_json: Json = False,
 ) -> None:
     """Learn several ways of sorting onions from one jumble: how many there are, who did what, and why."""
-    from ..studies.sorting import page as sorting_report
+    from ..studies.sorting import page as sorting_page
     from ..studies.sorting import study as sorting_study
 
     with reported_errors(), progress(as_json) as advance:
         study = sorting_study.sorting_study(
-            tasks, sorting_study.counts_of(tasks, trajectories), runs=runs, seed=seed, sessions=sessions,
-            n_components=n_components, steps=steps, belts=belts, advance=advance,
+            tasks,
+            sorting_study.counts_of(tasks, trajectories),
+            replications=replications,
+            seed=seed,
+            sessions=sessions,
+            n_components=n_components,
+            steps=steps,
+            belts=belts,
+            advance=advance,
             methods=None if method is MultiTask.all else (method.value,),
-        )  # fmt: skip
-        sorting_report.write(study, report)
-    print_results(sorting_report, study, report, as_json)
+        )
+        sorting_page.write(study, folder)
+    print_results(sorting_page, study, folder, as_json)
 
 
 @commands.command("robust-airl")
 def run_robust_airl(
     domain: Annotated[Domain, typer.Option(help="Task, with its expert and its sensor.")] = Domain.hopper,
-    seeds: Annotated[int, count_option("Independent repetitions.")] = 1,
+    replications: Annotated[int, count_option("Independent repetitions.")] = 1,
     sessions: Annotated[int | None, count_option("Sessions; by default the study's own number.")] = None,
     noise: Annotated[
         float, real_option("Times the study's noise (covariance, shift or probability).", 0)
     ] = 1.0,
-    workers: Annotated[int, count_option("Processes that share the runs.", most=1024)] = 1,
-    kept: Annotated[
-        Path | None, typer.Option(help="Folder where finished runs are kept and found again.")
+    workers: Annotated[int, count_option("Processes that share the replications.", most=1024)] = 1,
+    cache: Annotated[
+        Path | None, typer.Option(help="Folder of finished replications; a later command reuses them.")
     ] = None,
-    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-robust-airl"),
+    folder: Annotated[Path, typer.Option(help="Folder of the page and its results.")] = Path(
+        "report-robust-airl"
+    ),
     as_json: Json = False,
 ) -> None:
     """Learn rewards as networks from noisy reports: AIRL, robust-AIRL and SSRR, judged by the true reward."""
@@ -205,10 +230,10 @@ def run_robust_airl(
 
     with reported_errors(), progress(as_json) as advance:
         results = robust_airl.answer(
-            domain.value, seeds, sessions, noise, workers=workers, kept=kept, advance=advance
+            domain.value, replications, sessions, noise, workers=workers, cache=cache, advance=advance
         )
-        robust_airl.write(results, report)
-    print_results(robust_airl, results, report, as_json)
+        robust_airl.write(results, folder)
+    print_results(robust_airl, results, folder, as_json)
 
 
 NoisyRuns = Annotated[int, count_option("Independent repetitions.")]
@@ -221,47 +246,57 @@ StartsOption = Annotated[
 
 @commands.command("noisy-sorting")
 def run_noisy_sorting(
-    runs: NoisyRuns = 50,
+    replications: NoisyRuns = 50,
     sessions: NoisySessions = 20,
     starts: StartsOption = NoisyStarts.all,
     belts: Annotated[int, count_option("Simulated belts for each method.")] = 1000,
     seed: Seed = 0,
-    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-noisy-sorting"),
+    folder: Annotated[Path, typer.Option(help="Folder of the page and its results.")] = Path(
+        "report-noisy-sorting"
+    ),
     as_json: Json = False,
 ) -> None:
     """Learn to sort onions from reports that may be wrong, and how often they are."""
-    _run_noisy("sorting", runs, sessions, starts, seed, report, as_json, belts=belts)
+    _run_noisy("sorting", replications, sessions, starts, seed, folder, as_json, belts=belts)
 
 
 @commands.command("noisy-patrol")
 def run_noisy_patrol(
-    runs: NoisyRuns = 50,
+    replications: NoisyRuns = 50,
     sessions: NoisySessions = 20,
     starts: StartsOption = NoisyStarts.all,
     seed: Seed = 0,
-    report: Annotated[Path, typer.Option(help="Folder for the report.")] = Path("report-noisy-patrol"),
+    folder: Annotated[Path, typer.Option(help="Folder of the page and its results.")] = Path(
+        "report-noisy-patrol"
+    ),
     as_json: Json = False,
 ) -> None:
     """Learn a patroller's reward from reports that may be wrong, also where most of it is out of view."""
-    _run_noisy("patrol", runs, sessions, starts, seed, report, as_json)
+    _run_noisy("patrol", replications, sessions, starts, seed, folder, as_json)
 
 
 def _run_noisy(
     task: str,
-    runs: int,
+    replications: int,
     sessions: int,
     starts: NoisyStarts,
     seed: int,
-    report: Path,
+    folder: Path,
     as_json: bool,
     **options: Any,
 ) -> None:
-    from ..studies.noisy import page as noisy_report
+    from ..studies.noisy import page as noisy_page
     from ..studies.noisy import study as noisy_study
 
     with reported_errors(), progress(as_json) as advance:
         study = noisy_study.noisy_study(
-            task, runs=runs, sessions=sessions, starts=starts.value, seed=seed, advance=advance, **options
+            task,
+            replications=replications,
+            sessions=sessions,
+            starts=starts.value,
+            seed=seed,
+            advance=advance,
+            **options,
         )
-        noisy_report.write(study, report)
-    print_results(noisy_report, study, report, as_json)
+        noisy_page.write(study, folder)
+    print_results(noisy_page, study, folder, as_json)

@@ -36,4 +36,4 @@ def simulate_patrol(
                 name = f"{patrol.name}-{i}-{agent}"
                 write_trajectories(
                     sys.stdout, demonstration.select([i]), patrol.mdp, ids=[name], agents=[agent]
-                )  # fmt: skip
+                )

@@ -153,7 +153,7 @@ def open_lines(
     if path == "-":
         source = "standard input"
         if sys.stdin is None:
-            raise ValueError("standard input is closed: give a file with --demos")
+            raise ValueError("standard input is closed: give a file with --demonstrations")
         pieces = iter(partial(sys.stdin.buffer.readline, _PIECE), b"")
     else:
         source = os.path.basename(path)

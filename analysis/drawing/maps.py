@@ -137,10 +137,17 @@ def _draw_mark(axes: Axes, theme: Theme, row: float, column: float, letter: str)
     )
     # In a corner, which glyphs leave free: those of a cell stand at the middles of its sides.
     axes.text(
-        column - 0.29, row - 0.29, letter, ha="center", va="center_baseline", color=theme.goal,
-        fontweight="bold", fontsize=7.5, zorder=6,
+        column - 0.29,
+        row - 0.29,
+        letter,
+        ha="center",
+        va="center_baseline",
+        color=theme.goal,
+        fontweight="bold",
+        fontsize=7.5,
+        zorder=6,
         bbox={"boxstyle": "square,pad=0.08", "facecolor": theme.surface, "edgecolor": "none", "alpha": 0.85},
-    )  # fmt: skip
+    )
 
 
 def _draw_floor(
@@ -173,9 +180,12 @@ def _draw_floor(
 def _draw_key(axes: Axes, theme: Theme, marked: bool, occluded: bool) -> None:
     """What glyphs and fills mean, drawn with the map's own glyphs, facing up."""
     key: list[tuple[int | str, str]] = [
-        (FORWARD, "moves forward"), (LEFT, "turns left"), (RIGHT, "turns right"), (STOP, "stops"),
+        (FORWARD, "moves forward"),
+        (LEFT, "turns left"),
+        (RIGHT, "turns right"),
+        (STOP, "stops"),
         ("mismatch", "differs from the expert"),
-    ]  # fmt: skip
+    ]
     key += [("view", "in the learner's view"), ("cell", "out of view")] if occluded else []
     key += [("S", "the learner's start"), ("G", "its goal")] if marked else []
     axes.set_axis_off()
@@ -183,10 +193,14 @@ def _draw_key(axes: Axes, theme: Theme, marked: bool, occluded: bool) -> None:
     axes.set_ylim(1.9 + len(key), -0.2)
     axes.set_aspect("equal", anchor="NW")
     axes.text(
-        0, 0,
+        0,
+        0,
         "A state is a cell and a heading:\nthe glyph at a cell's right edge is\nwhat it does facing right.",
-        color=theme.ink, fontsize=SMALL, va="top", linespacing=1.3,
-    )  # fmt: skip
+        color=theme.ink,
+        fontsize=SMALL,
+        va="top",
+        linespacing=1.3,
+    )
     for i, (what, label) in enumerate(key):
         y = 2.3 + i
         axes.text(1.1, y, label, color=theme.ink, fontsize=SMALL + 0.5, va="center")
@@ -266,9 +280,16 @@ def hidden_path(
         axes.plot(line_x, line_y, color=theme.series[1], linewidth=1.2, zorder=3)
         for which, fill in ((seen, theme.series[1]), (~seen, theme.surface)):
             axes.plot(
-                seconds[which], cells_walked[which], linestyle="none", marker="o", markersize=3.8,
-                markeredgewidth=1.1, color=theme.series[1], markerfacecolor=fill, zorder=4,
-            )  # fmt: skip
+                seconds[which],
+                cells_walked[which],
+                linestyle="none",
+                marker="o",
+                markersize=3.8,
+                markeredgewidth=1.1,
+                color=theme.series[1],
+                markerfacecolor=fill,
+                zorder=4,
+            )
         line: dict[str, Any] = {"color": theme.series[1], "linewidth": 1.2, "marker": "o", "markersize": 4}
         handles = [
             Line2D([], [], **line, label="true path, seen"),
@@ -302,9 +323,13 @@ def _draw_strip(
         spine.set_visible(False)
     axes.legend(
         handles=[Patch(color=theme.goal, label="in view"), Patch(color=theme.cell, label="hidden")],
-        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, fontsize=SMALL,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=2,
+        frameon=False,
+        fontsize=SMALL,
         labelcolor=theme.ink,
-    )  # fmt: skip
+    )
 
 
 def corridors(cells: Sequence[Cell]) -> tuple[tuple[Cell, ...], ...]:

@@ -235,24 +235,26 @@ def _log_likelihoods(
 
 
 class Band(NamedTuple):
-    """Median and quantiles of repeated runs."""
+    """Median and quantiles of replications."""
 
     low: Float[np.ndarray, " ..."]
     median: Float[np.ndarray, " ..."]
     high: Float[np.ndarray, " ..."]
 
 
-def quantile_band(runs: Float[np.ndarray, "seeds ..."], coverage: float = 0.5) -> Band:
+def quantile_band(replications: Float[np.ndarray, "replications ..."], coverage: float = 0.5) -> Band:
     """Median and central quantiles over the first axis; ``coverage`` 0.5 gives the quartiles.
 
-    The band says where the middle ``coverage`` of the runs lie; it is not a confidence interval of the
-    median. A NaN among the runs makes its column NaN rather than vanish. Raises ``ValueError`` without
-    runs or for a coverage outside (0, 1).
+    The band says where the middle ``coverage`` of the replications lie; it is not a confidence interval of
+    the median. A NaN among the replications makes its column NaN rather than vanish. Raises ``ValueError``
+    without replications or for a coverage outside (0, 1).
     """
-    runs = np.asarray(runs, float)
-    if runs.ndim < 1 or runs.shape[0] == 0:
-        raise ValueError(f"a band needs at least one run along the first axis, got shape {runs.shape}")
+    replications = np.asarray(replications, float)
+    if replications.ndim < 1 or replications.shape[0] == 0:
+        raise ValueError(
+            f"a band needs at least one run along the first axis, got shape {replications.shape}"
+        )
     if not 0 < coverage < 1:
         raise ValueError(f"coverage must lie in (0, 1), got {coverage}")
     tail = (1 - coverage) / 2
-    return Band(*np.quantile(runs, [tail, 0.5, 1 - tail], axis=0))
+    return Band(*np.quantile(replications, [tail, 0.5, 1 - tail], axis=0))

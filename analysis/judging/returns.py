@@ -353,8 +353,8 @@ class Recovery(NamedTuple):
 
     Fields
     ------
-    share : float, ``(robust - noisy) / (clean - noisy)`` of the means over seeds
-    low, high : float, its interval; infinite ends where too few seeds show a loss at all
+    share : float, ``(robust - noisy) / (clean - noisy)`` of the means over replications
+    low, high : float, its interval; infinite ends where too few replications show a loss at all
     lost : float, share of resamples in which noise cost something
     n : int, seeds
     """
@@ -375,20 +375,20 @@ def recovered_share(
     coverage: float = 0.95,
     resamples: int = 10_000,
 ) -> Recovery:
-    """What of the return (or LBA) lost to noise a robust learner recovers, with a bootstrap over seeds.
+    """Estimate the share of the return (or LBA) lost to noise that a robust learner recovers.
 
     Entry ``i`` of all three is of the same seed, and seeds are drawn together. Where noise may have cost
-    nothing, the ratio has a pole: means without a loss, of the seeds or of a resample, count as minus or plus
-    infinity by what the robust learner gained. Of a few seeds a bootstrap's interval is too narrow. Raises
-    ``ValueError`` for different numbers of seeds, none, or numbers that are not finite.
+    nothing, the ratio has a pole: means without a loss, of the replications or of a resample, count as minus
+    or plus infinity by what the robust learner gained. Of a few replications a bootstrap's interval is too
+    narrow. Raises ``ValueError`` for different numbers of replications, none, or numbers that are not finite.
     """
-    runs = [np.asarray(x, float) for x in (clean, noisy, robust)]
-    n = len(runs[0])
-    if n == 0 or any(x.shape != (n,) for x in runs):
+    replications = [np.asarray(x, float) for x in (clean, noisy, robust)]
+    n = len(replications[0])
+    if n == 0 or any(x.shape != (n,) for x in replications):
         raise ValueError(
-            f"clean, noisy and robust need one number a seed, got shapes {[x.shape for x in runs]}"
+            f"clean, noisy and robust need one number a seed, got shapes {[x.shape for x in replications]}"
         )
-    for name, values in zip(("clean", "noisy", "robust"), runs, strict=True):
+    for name, values in zip(("clean", "noisy", "robust"), replications, strict=True):
         if not np.isfinite(values).all():
             raise ValueError(f"seed {int(np.argmin(np.isfinite(values)))} of {name} is not finite")
 
@@ -396,7 +396,7 @@ def recovered_share(
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(lost > 0, gained / lost, np.copysign(np.inf, gained))
 
-    cost, won = runs[0] - runs[1], runs[2] - runs[1]
+    cost, won = replications[0] - replications[1], replications[2] - replications[1]
     weights = np.asarray(_resampled(key, n, resamples), float) / n
     lost, share = weights @ cost, ratio(cost.mean(), won.mean())
     drawn = ratio(lost, weights @ won)
@@ -407,18 +407,20 @@ def recovered_share(
 
 
 class SeedInterval(NamedTuple):
-    """A mean over seeds and its interval."""
+    """A mean over replications and its interval."""
 
     mean: Float[np.ndarray, "..."]
     low: Float[np.ndarray, "..."]
     high: Float[np.ndarray, "..."]
 
 
-def seed_interval(runs: Float[np.ndarray, "seeds ..."], coverage: float = 0.95) -> SeedInterval:
-    """Mean over the first axis with Student's interval, which a handful of seeds need; NaN ends for one."""
-    runs = np.asarray(runs, float)
-    n, mean = len(runs), runs.mean(0)
+def seed_interval(
+    replications: Float[np.ndarray, "replications ..."], coverage: float = 0.95
+) -> SeedInterval:
+    """Compute the mean over the first axis with Student's interval; its ends are NaN for one replication."""
+    replications = np.asarray(replications, float)
+    n, mean = len(replications), replications.mean(0)
     if n < 2:
         return SeedInterval(mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan))
-    half = stats.t.ppf(0.5 + coverage / 2, n - 1) * runs.std(0, ddof=1) / math.sqrt(n)
+    half = stats.t.ppf(0.5 + coverage / 2, n - 1) * replications.std(0, ddof=1) / math.sqrt(n)
     return SeedInterval(mean, mean - half, mean + half)

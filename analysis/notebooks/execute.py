@@ -60,9 +60,13 @@ def execute_notebook(
         work = Path(folder, "work")
         work.mkdir()
         client = NotebookClient(
-            notebook, km=manager, timeout=timeout, record_timing=False, coalesce_streams=True,
+            notebook,
+            km=manager,
+            timeout=timeout,
+            record_timing=False,
+            coalesce_streams=True,
             resources={"metadata": {"path": str(work)}},
-        )  # fmt: skip
+        )
         environment = os.environ | {
             "IPYTHONDIR": os.path.join(folder, "ipython"),
             "COLUMNS": "100",

@@ -190,8 +190,12 @@ def posterior_by_session(
     DemonstrationError, ValueError
         As there, and ``ValueError`` for sessions that do not exist or do not increase.
     """
-    for name, number, least in (("draws", draws, 1), ("chains", chains, 1), ("warmup", warmup, 0),
-                                ("trajectories", trajectories, 1)):  # fmt: skip
+    for name, number, least in (
+        ("draws", draws, 1),
+        ("chains", chains, 1),
+        ("warmup", warmup, 0),
+        ("trajectories", trajectories, 1),
+    ):
         if number < least:
             raise ValueError(f"{name} must be at least {least}, got {number}")
     key, demonstration = as_key(key), checked_demonstration(mdp, demonstration)
@@ -219,10 +223,14 @@ def posterior_by_session(
         lambda x: np.moveaxis(x.reshape(len(numbers), chains, *x.shape[1:]), 0, 2), in_threads(run, jobs)
     )
     configuration = {
-        "draws": draws, "warmup": warmup, "chains": chains, "target_accept": target_accept,
-        "max_tree_depth": max_tree_depth, "trajectories": trajectories,
+        "draws": draws,
+        "warmup": warmup,
+        "chains": chains,
+        "target_accept": target_accept,
+        "max_tree_depth": max_tree_depth,
+        "trajectories": trajectories,
         "key": np.asarray(jax.random.key_data(key)),
-    }  # fmt: skip
+    }
     attrs = {
         **provenance(mdp, "NUTS over weights, hidden steps summed out", configuration),
         "inference_library": "numpyro",

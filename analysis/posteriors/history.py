@@ -159,9 +159,11 @@ def _history(
         )
     numbers = columns.pop("session").reshape(-1, len(infos))[0]
     coords: dict[str, Any] = {
-        "session": numbers, "feature": list(mdp.feature_names), "state": list(mdp.state_names),
+        "session": numbers,
+        "feature": list(mdp.feature_names),
+        "state": list(mdp.state_names),
         "action": list(mdp.action_names),
-    }  # fmt: skip
+    }
     if streams:
         coords["run"] = np.arange(len(weights))
     attrs = {**provenance(mdp, learner.name, learner.configuration, seed), "signature": learner.signature}

@@ -174,9 +174,12 @@ def predictive_check(idata: az.InferenceData, coverage: float = 0.9) -> xr.Datas
 
     return xr.Dataset(
         {
-            "observed": observed, "median": median, "low": low, "high": high,
+            "observed": observed,
+            "median": median,
+            "low": low,
+            "high": high,
             "p_value": (draws > observed).mean(over) + 0.5 * (draws == observed).mean(over),
             "discrepancy_p_value": (discrepancy(draws) >= discrepancy(observed)).mean(),
         },
         attrs={"coverage": coverage},
-    )  # fmt: skip
+    )

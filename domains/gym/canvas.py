@@ -119,9 +119,17 @@ def draw_key(axes: Axes, marks: Sequence[tuple[str, str, str]], columns: int = 4
             handle.set_markeredgewidth(1.8)
         handles.append(handle)
     axes.legend(
-        handles=handles, loc="upper left", ncols=columns, frameon=False, fontsize=8, labelcolor=INK,
-        borderaxespad=0.1, handletextpad=0.1, columnspacing=0.9, handlelength=1.6,
-    )  # fmt: skip
+        handles=handles,
+        loc="upper left",
+        ncols=columns,
+        frameon=False,
+        fontsize=8,
+        labelcolor=INK,
+        borderaxespad=0.1,
+        handletextpad=0.1,
+        columnspacing=0.9,
+        handlelength=1.6,
+    )
 
 
 def number_cells(axes: Axes, rows: range, columns: range, gap: float = 0.62) -> None:

@@ -52,8 +52,13 @@ BACK, LEFT, RIGHT = range(3)
 ENTRIES = ("from above", "from the left child", "from the right child", "at an end", "at home")
 FROM_ABOVE, FROM_LEFT, FROM_RIGHT, AT_END, AT_HOME = range(5)
 SHARED_FEATURES = (
-    "reaches home", "reaches the water port", "reaches an end", "turns round", "goes deeper", "level",
-)  # fmt: skip
+    "reaches home",
+    "reaches the water port",
+    "reaches an end",
+    "turns round",
+    "goes deeper",
+    "level",
+)
 _TURNS_ROUND, _GOES_DEEPER = 3, 4
 _NODE_FEATURES = tuple(f"reaches {n}" for n in range(N_NODES))
 
@@ -186,9 +191,13 @@ def _entry(node: int, target: int) -> int:
 def _features(node: int, entry: int, action: int, target: int) -> Float[np.ndarray, " K"]:
     came_from = {FROM_ABOVE: BACK, FROM_LEFT: LEFT, FROM_RIGHT: RIGHT, AT_END: BACK}[entry]
     shared = [
-        target == HOME, target == WATER_PORT, FIRST_END <= target < N_NODES, action == came_from,
-        action != BACK, max(level_of(target), 0) / LEVELS,
-    ]  # fmt: skip
+        target == HOME,
+        target == WATER_PORT,
+        FIRST_END <= target < N_NODES,
+        action == came_from,
+        action != BACK,
+        max(level_of(target), 0) / LEVELS,
+    ]
     return np.concatenate([np.array(shared, float), np.arange(N_NODES) == target])
 
 

@@ -49,9 +49,15 @@ Starts = Literal["all", "natural"]
 Scores = Literal["calibrated", "product"]
 
 SORTING_PREDICATES = (
-    "blemished onion", "move with hand", "start from conveyor", "leaving at eye", "onion to bin",
-    "hand to bin", "onion to table", "hand to table",
-)  # fmt: skip
+    "blemished onion",
+    "move with hand",
+    "start from conveyor",
+    "leaving at eye",
+    "onion to bin",
+    "hand to bin",
+    "onion to table",
+    "hand to table",
+)
 PATROL_PREDICATES = ("move forward", "turn left", "in the top row", "turn right")
 
 SORTING_LABELS = ("onion location", "hand location")
@@ -75,9 +81,15 @@ def sorting_predicates(sorting: onions.Sorting) -> Bool[np.ndarray, "8 S A"]:
     to_table, to_bin = action == onions.PLACE_ON_CONVEYOR, action == onions.PLACE_IN_BIN
     moves = to_table | to_bin | (action == onions.PICK)
     return _stacked(
-        prediction == onions.BLEMISHED, moves, onion == onions.TABLE, (hand == onions.AT_EYES) & moves,
-        to_bin, to_bin, to_table, to_table,
-    )  # fmt: skip
+        prediction == onions.BLEMISHED,
+        moves,
+        onion == onions.TABLE,
+        (hand == onions.AT_EYES) & moves,
+        to_bin,
+        to_bin,
+        to_table,
+        to_table,
+    )
 
 
 def patrol_predicates(patrol: patrols.Patrol) -> Bool[np.ndarray, "4 S A"]:
@@ -198,11 +210,16 @@ def noisy_sorting(
         _flat(sorting.mdp, actions=_exchanged(sorting.mdp, onions.PLACE_ON_CONVEYOR, onions.PLACE_IN_BIN)),
     )
     return NoisyTask(
-        "noisy " + sorting.name, sorting.mdp, sorting.weights[0], sorting.expert_policy(0),
-        SORTING_PREDICATES, sorting_predicates(sorting),
+        "noisy " + sorting.name,
+        sorting.mdp,
+        sorting.weights[0],
+        sorting.expert_policy(0),
+        SORTING_PREDICATES,
+        sorting_predicates(sorting),
         SwapNoise(np.stack(swaps), np.array([prediction_noise, place_noise])),
-        SORTING_LABELS, sorting_labels(sorting),
-    )  # fmt: skip
+        SORTING_LABELS,
+        sorting_labels(sorting),
+    )
 
 
 def noisy_patrol(noise: float = SWAP) -> NoisyTask:
@@ -216,9 +233,16 @@ def noisy_patrol(noise: float = SWAP) -> NoisyTask:
     mdp = replace(patrol.mdp, initial=jnp.asarray(_stationary(patrol.mdp, policy)))
     swap = _flat(mdp, actions=_exchanged(mdp, patrols.FORWARD, patrols.RIGHT))
     return NoisyTask(
-        "noisy patrol", mdp, patrol.weights, policy, PATROL_PREDICATES, patrol_predicates(patrol),
-        SwapNoise(swap[None], np.array([noise])), PATROL_LABELS, patrol_labels(patrol),
-    )  # fmt: skip
+        "noisy patrol",
+        mdp,
+        patrol.weights,
+        policy,
+        PATROL_PREDICATES,
+        patrol_predicates(patrol),
+        SwapNoise(swap[None], np.array([noise])),
+        PATROL_LABELS,
+        patrol_labels(patrol),
+    )
 
 
 def feature_noise(task: NoisyTask, confused: float = 1 - SWAP, clear: float = 0.99) -> FeatureNoise:

@@ -86,9 +86,11 @@ def line_of_sight(patrol: Patrol, reach: float) -> Bool[np.ndarray, "C S"]:
     east, north, west, south = (heading == h for h in range(4))
     row, column = down == 0, right == 0
     ahead = (
-        (east & row & (right >= 0)) | (west & row & (right <= 0))
-        | (north & column & (down <= 0)) | (south & column & (down >= 0))
-    )  # fmt: skip
+        (east & row & (right >= 0))
+        | (west & row & (right <= 0))
+        | (north & column & (down <= 0))
+        | (south & column & (down >= 0))
+    )
     return ahead & (np.hypot(down, right) <= reach)
 
 

@@ -25,8 +25,11 @@ class BreachScene:
         assert patrol.breach is not None
         self._patrol, self._states, self._sees = patrol, states, sees
         marks = [
-            (">", WATER, "learner"), (">", AGENT, "patroller"), ("s", GOAL, "goal"), ("s", SEEN, "seen"),
-        ]  # fmt: skip
+            (">", WATER, "learner"),
+            (">", AGENT, "patroller"),
+            ("s", GOAL, "goal"),
+            ("s", SEEN, "seen"),
+        ]
         axes, self._columns = draw_floor(patrol.breach.cells, marks, lines=2)
         goals = [outline(axes) for _ in patrol.breach.goals]
         for frame, (row, column) in zip(goals, patrol.breach.goals, strict=True):

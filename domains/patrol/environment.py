@@ -75,8 +75,11 @@ class BreachEnv(gymnasium.Env[np.ndarray, int]):
         task = breach_task(patrol, settings.reach)
         assert patrol.breach is not None  # or there were no task
         self.patrol, self.interaction, self.settings, self.render_mode = (
-            patrol, interaction, settings, render_mode,
-        )  # fmt: skip
+            patrol,
+            interaction,
+            settings,
+            render_mode,
+        )
         self.states = tuple(State(r, c, h) for r, c in patrol.breach.cells for h in range(len(HEADINGS)))
         patrol.visibility(observability)  # refuses a view that is not there
         self._seen = patrol.views[observability]

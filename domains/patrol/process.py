@@ -153,9 +153,15 @@ def simulate_patrol(
     """
     cells = jnp.asarray(patrol.cell_of_state)
     return simulate_patrollers(
-        key, patrol.mdp, cells, jnp.asarray(log_policies), jnp.asarray(start), interaction.equilibrium,
-        interaction.length, steps,
-    )  # fmt: skip
+        key,
+        patrol.mdp,
+        cells,
+        jnp.asarray(log_policies),
+        jnp.asarray(start),
+        interaction.equilibrium,
+        interaction.length,
+        steps,
+    )
 
 
 @partial(jax.jit, static_argnums=(5, 6, 7))
@@ -326,11 +332,19 @@ def four_hallways() -> Patrol:
         return tuple(target.phase == k != state.phase for k in range(1, 5))
 
     return _build(
-        "patrol1", states, intend, features, tuple(f"switch to hallway {k}" for k in range(1, 5)),
-        (0.25, 0.25, 0.25, 0.25), success=0.99, discount=0.995, patrollers=1,
+        "patrol1",
+        states,
+        intend,
+        features,
+        tuple(f"switch to hallway {k}" for k in range(1, 5)),
+        (0.25, 0.25, 0.25, 0.25),
+        success=0.99,
+        discount=0.995,
+        patrollers=1,
         views={30: lambda s: s.column == 4 and s.row >= 3, 44: lambda s: s.column == 4, 100: lambda s: True},
-        breach=None, loop=64,
-    )  # fmt: skip
+        breach=None,
+        loop=64,
+    )
 
 
 @cache
@@ -366,12 +380,26 @@ def boyd_fifth_floor() -> Patrol:
         100: lambda s: True,
     }
     return _build(
-        "patrol2", _grid_states(cells), _walk(cells), features,
-        ("moves", "turns in hallway", "turns at corner", "turns in division 1", "turns in division 2",
-         "turns in division 3"),
-        (4 / 7, 0, 0, 0, 3 / 7, 0), success=0.95, discount=0.99, patrollers=2, views=views,
-        breach=Breach(tuple(sorted(cells | {(0, 0)})), State(0, 0, 0), ((9, 1),), 0.99), loop=56,
-    )  # fmt: skip
+        "patrol2",
+        _grid_states(cells),
+        _walk(cells),
+        features,
+        (
+            "moves",
+            "turns in hallway",
+            "turns at corner",
+            "turns in division 1",
+            "turns in division 2",
+            "turns in division 3",
+        ),
+        (4 / 7, 0, 0, 0, 3 / 7, 0),
+        success=0.95,
+        discount=0.99,
+        patrollers=2,
+        views=views,
+        breach=Breach(tuple(sorted(cells | {(0, 0)})), State(0, 0, 0), ((9, 1),), 0.99),
+        loop=56,
+    )
 
 
 @cache
@@ -408,25 +436,44 @@ def boyd_with_rooms() -> Patrol:
     k2 = [*k1, lambda r, c: r == 0 and c >= 10]
     k4 = [*k2, lambda r, c: r <= 1 and c >= 10, lambda r, c: r <= 6 and c in (15, 16)]
     k6 = [
-        *k4, lambda r, c: r == 0 and c >= 8, lambda r, c: r == 2 and c >= 9, lambda r, c: r == 5 and c >= 14,
+        *k4,
+        lambda r, c: r == 0 and c >= 8,
+        lambda r, c: r == 2 and c >= 9,
+        lambda r, c: r == 5 and c >= 14,
         lambda r, c: r <= 7 and c == 16,
-    ]  # fmt: skip
+    ]
     k10 = [
-        *k6, lambda r, c: r == 0 and c >= 6, lambda r, c: r <= 4 and c >= 10, lambda r, c: r == 5 and c >= 12,
-        lambda r, c: r <= 7 and c >= 14, lambda r, c: r <= 11 and c >= 15,
-    ]  # fmt: skip
+        *k6,
+        lambda r, c: r == 0 and c >= 6,
+        lambda r, c: r <= 4 and c >= 10,
+        lambda r, c: r == 5 and c >= 12,
+        lambda r, c: r <= 7 and c >= 14,
+        lambda r, c: r <= 11 and c >= 15,
+    ]
     return _build(
-        "patrol3", _grid_states(cells), _walk(cells), features,
+        "patrol3",
+        _grid_states(cells),
+        _walk(cells),
+        features,
         ("moves", "in a room", "turns left in hallway", "enters a room", "leaves a room"),
-        (1.0, -1.0, 0.1, 0.0, 0.0), success=0.99, discount=0.99, patrollers=2,
+        (1.0, -1.0, 0.1, 0.0, 0.0),
+        success=0.99,
+        discount=0.99,
+        patrollers=2,
         views={
-            9: view(*k1), 18: view(*k2), 33: view(*k4), 46: view(*k6), 65: view(*k10), 100: lambda s: True
+            9: view(*k1),
+            18: view(*k2),
+            33: view(*k4),
+            46: view(*k6),
+            65: view(*k10),
+            100: lambda s: True,
         },
         breach=Breach(
             tuple(sorted(cells | {(0, 17), (1, 0), (13, 13)})), State(0, 17, 2), ((1, 0), (13, 13)), 0.95
         ),
-        loop=64, observability=18,
-    )  # fmt: skip
+        loop=64,
+        observability=18,
+    )
 
 
 def instance(number: int) -> Patrol:

@@ -200,12 +200,27 @@ def breach_trials(
     length = 64 * math.ceil((max(deadline, observed_steps) + 1) / 64) + settings.horizon
     true_policy = jnp.log(jnp.asarray(patrol.expert_policy()))
     ended, waited = _trials(
-        jax.random.split(key, trials), jnp.asarray(ready), patrol.mdp, jnp.asarray(patrol.cell_of_state),
-        patrol.visibility(observability), jnp.broadcast_to(true_policy, expected), log_policies,
-        world, breach_task(patrol, believed.reach),
-        settings, believed, jnp.array(observed_steps), jnp.array(deadline),
-        settings.horizon, length, tuple(interaction.equilibrium), interaction.length, watcher, forecast, go,
-    )  # fmt: skip
+        jax.random.split(key, trials),
+        jnp.asarray(ready),
+        patrol.mdp,
+        jnp.asarray(patrol.cell_of_state),
+        patrol.visibility(observability),
+        jnp.broadcast_to(true_policy, expected),
+        log_policies,
+        world,
+        breach_task(patrol, believed.reach),
+        settings,
+        believed,
+        jnp.array(observed_steps),
+        jnp.array(deadline),
+        settings.horizon,
+        length,
+        tuple(interaction.equilibrium),
+        interaction.length,
+        watcher,
+        forecast,
+        go,
+    )
     return BreachOutcome(np.asarray(ended), np.asarray(waited), float(threshold))
 
 

@@ -91,10 +91,14 @@ class Line(NamedTuple):
     def seconds(self) -> tuple[float, ...]:
         """Duration of each action, in the order of ``ACTIONS``."""
         by_action = {
-            INSPECT: self.inspect_seconds, PLACE_ON_CONVEYOR: self.place_seconds,
-            PLACE_IN_BIN: self.place_seconds, PICK: self.pick_seconds, CLAIM_NEW: self.claim_seconds,
-            ROLL: self.roll_seconds, CLAIM_LISTED: self.claim_seconds,
-        }  # fmt: skip
+            INSPECT: self.inspect_seconds,
+            PLACE_ON_CONVEYOR: self.place_seconds,
+            PLACE_IN_BIN: self.place_seconds,
+            PICK: self.pick_seconds,
+            CLAIM_NEW: self.claim_seconds,
+            ROLL: self.roll_seconds,
+            CLAIM_LISTED: self.claim_seconds,
+        }
         return tuple(by_action[a] for a in range(len(ACTIONS)))
 
 
@@ -209,9 +213,15 @@ def sort_belts(
     # Padded to a power of two, so that many numbers of belts share a compiled program.
     padded = 1 << max(8, (belts - 1).bit_length())
     counts = _sort_belts(
-        jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(padded)), log_policy, process, speeds, chances,
-        jnp.array(line.blemished), line.sets, line.onions,
-    )  # fmt: skip
+        jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(padded)),
+        log_policy,
+        process,
+        speeds,
+        chances,
+        jnp.array(line.blemished),
+        line.sets,
+        line.onions,
+    )
     return Tally(*np.asarray(counts)[:belts].T)
 
 
@@ -349,9 +359,13 @@ def _sort_belts(
     def sort_set(hand: Int[Array, ""], key: Array) -> tuple:
         first, key = jax.random.split(key)
         begin = _World(
-            process.start[hand], jnp.zeros(()), jnp.zeros((), int), jax.random.randint(first, (), 0, onions),
-            jnp.full(onions, UNSORTED), jnp.zeros(onions, bool),
-        )  # fmt: skip
+            process.start[hand],
+            jnp.zeros(()),
+            jnp.zeros((), int),
+            jax.random.randint(first, (), 0, onions),
+            jnp.full(onions, UNSORTED),
+            jnp.zeros(onions, bool),
+        )
         end = lax.while_loop(
             lambda world: (world.clock < allowed) & jnp.any(world.where == UNSORTED), partial(act, key), begin
         )

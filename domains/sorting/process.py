@@ -47,10 +47,18 @@ ACTIONS = ("inspect", "place on conveyor", "place in bin", "pick", "claim new", 
 INSPECT, PLACE_ON_CONVEYOR, PLACE_IN_BIN, PICK, CLAIM_NEW, ROLL, CLAIM_LISTED = range(7)
 
 FEATURES = (
-    "good on table", "blemished not on table", "good not in bin", "blemished in bin", "not idle",
-    "claims a new onion", "makes a list", "picks unknown", "picks blemished", "empties the list",
+    "good on table",
+    "blemished not on table",
+    "good not in bin",
+    "blemished in bin",
+    "not idle",
+    "claims a new onion",
+    "makes a list",
+    "picks unknown",
+    "picks blemished",
+    "empties the list",
     "inspects a held onion",
-)  # fmt: skip
+)
 
 BEHAVIOURS = ("pick-inspect-place", "roll-pick-place", "keep claiming")
 _RAW_WEIGHTS = np.array([
@@ -167,9 +175,13 @@ def pick_inspect_place() -> Sorting:
     binned = [State(BIN, UNKNOWN, h, NO_LIST) for h in range(4)]
     weights = _RAW_PICK_INSPECT_PLACE / _RAW_PICK_INSPECT_PLACE.sum()
     return _sorting(
-        "pick-inspect-place", (*table, *held, *inspected, *binned), _without_list, _deeds, BEHAVIOURS[:1],
+        "pick-inspect-place",
+        (*table, *held, *inspected, *binned),
+        _without_list,
+        _deeds,
+        BEHAVIOURS[:1],
         weights[None],
-    )  # fmt: skip
+    )
 
 
 def demonstrate_sorting(
@@ -347,9 +359,15 @@ def _sorting(
                 transition_features[i, action] += probability * ((1 - SLIP) * fired + SLIP * stays)
     initial = np.array([_may_start(state, states) for state in states], float)
     mdp = TabularMDP.from_dense(
-        transitions, features, initial=initial / initial.sum(), discount=DISCOUNT, available=available,
-        states=[state.name for state in states], actions=ACTIONS, feature_names=FEATURES,
-    )  # fmt: skip
+        transitions,
+        features,
+        initial=initial / initial.sum(),
+        discount=DISCOUNT,
+        available=available,
+        states=[state.name for state in states],
+        actions=ACTIONS,
+        feature_names=FEATURES,
+    )
     return Sorting(name, mdp, np.array(states), transition_features, behaviours, weights)
 
 

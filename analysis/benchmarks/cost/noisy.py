@@ -82,9 +82,13 @@ class Growth(NamedTuple):
 def stream_of(task: NoisyTask, sessions: int, trajectories: int = 2, steps: int = 3, seed: int = 0) -> Stream:
     """Scored reports of a noisy task."""
     drawn = demonstrate_noisy(
-        jax.random.key(seed), task, sessions=sessions, trajectories=trajectories, steps=steps,
+        jax.random.key(seed),
+        task,
+        sessions=sessions,
+        trajectories=trajectories,
+        steps=steps,
         scores="calibrated",
-    )  # fmt: skip
+    )
     return Stream(drawn.mdp, task.features, drawn.seen, trajectories)
 
 
@@ -184,13 +188,16 @@ def session_seconds(task: NoisyTask, sessions: int) -> dict[str, dict[str, float
     for name, x in spent.items():
         ratio, low, high = ratio_of_medians(x, spent[COUNTED])
         found[name] = {
-            "median": float(np.median(x)), "nine in ten below": float(np.quantile(x, 0.9)),
-            "times RIFOM": ratio, "from": low, "to": high,
-        }  # fmt: skip
+            "median": float(np.median(x)),
+            "nine in ten below": float(np.quantile(x, 0.9)),
+            "times RIFOM": ratio,
+            "from": low,
+            "to": high,
+        }
     return found
 
 
-def part_seconds(task: NoisyTask, sessions: int = 20, runs: int = 200) -> dict[str, float]:
+def part_seconds(task: NoisyTask, sessions: int = 20, replications: int = 200) -> dict[str, float]:
     """Seconds of each part of RIMEO's session, with scores step by step, compiled alone.
 
     At the state that a learner is in after ``sessions``. Reports are prepared once, the two fits occur
@@ -240,7 +247,7 @@ def part_seconds(task: NoisyTask, sessions: int = 20, runs: int = 200) -> dict[s
     found = {}
     for name, (part, arguments) in parts.items():
         compiled = jax.jit(part)
-        found[name] = median_seconds(lambda: jax.block_until_ready(compiled(*arguments)), runs)  # noqa: B023
+        found[name] = median_seconds(lambda: jax.block_until_ready(compiled(*arguments)), replications)  # noqa: B023
     return found
 
 
@@ -258,9 +265,10 @@ def pattern_seconds(
         told = report_statistic(classes, logits, reports, confidence, pairs)
         fit = jax.jit(lambda x, logits: fit_sensor(classes, x, 0.05, logits))  # noqa: B023
         found[str(number)] = {
-            "classes": len(classes.reportable), "patterns": len(classes.patterns),
+            "classes": len(classes.reportable),
+            "patterns": len(classes.patterns),
             "seconds of a fit": median_seconds(lambda: jax.block_until_ready(fit(told, logits)), 20),  # noqa: B023
-        }  # fmt: skip
+        }
     return found
 
 
@@ -302,7 +310,7 @@ def main() -> None:
         "pairs in a session (noisy patrol)": lambda: measured_growth(
             tuple(lengths), lambda pairs: stream_of(patrol, count, *lengths[pairs])
         ),
-    }  # fmt: skip
+    }
     results["growth"] = {}
     for title, study in studies.items():
         found = study()

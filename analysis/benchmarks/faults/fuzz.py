@@ -85,18 +85,59 @@ class Tally(NamedTuple):
 def tiny_process() -> TabularMDP:
     """Three named states and two named actions."""
     return TabularMDP.from_successors(
-        np.zeros((3, 2, 1), int), np.ones((3, 2, 1)), np.zeros((3, 2, 1)),
-        states=("bin", "the table", "größe"), actions=("grasp", "place"),
-    )  # fmt: skip
+        np.zeros((3, 2, 1), int),
+        np.ones((3, 2, 1)),
+        np.zeros((3, 2, 1)),
+        states=("bin", "the table", "größe"),
+        actions=("grasp", "place"),
+    )
 
 
 _VALUES = (
-    "null", "true", "false", "0", "-0", "1", "-1", "3", "127", "128", "1.0", "0.5", "1.5", "1e999", "-1e999",
-    "NaN", "Infinity", "-Infinity", "99999999999999999999", "1" * 4301, "[]", "{}", "[[]]", '""', '"hidden"',
-    '"s"', '"\\ud800"', '"\\u0000"', '"\\u001b[31m"', "[" * 500, "[" * 2000, '{"s":' * 300,
+    "null",
+    "true",
+    "false",
+    "0",
+    "-0",
+    "1",
+    "-1",
+    "3",
+    "127",
+    "128",
+    "1.0",
+    "0.5",
+    "1.5",
+    "1e999",
+    "-1e999",
+    "NaN",
+    "Infinity",
+    "-Infinity",
+    "99999999999999999999",
+    "1" * 4301,
+    "[]",
+    "{}",
+    "[[]]",
+    '""',
+    '"hidden"',
+    '"s"',
+    '"\\ud800"',
+    '"\\u0000"',
+    '"\\u001b[31m"',
+    "[" * 500,
+    "[" * 2000,
+    '{"s":' * 300,
     '{"s": 1, "s": 2}',
-    '"' + "x" * 5000 + '"', "\ufeff", "\x00", "\x1b[2J", "\u2028", "\ud800", "'bin'", "// no", "1_000", "٣",
-)  # fmt: skip
+    '"' + "x" * 5000 + '"',
+    "\ufeff",
+    "\x00",
+    "\x1b[2J",
+    "\u2028",
+    "\ud800",
+    "'bin'",
+    "// no",
+    "1_000",
+    "٣",
+)
 _ALPHABET = '{}[]",:0123456789.eE+-satn \t\\/\x00\x7f\u00e9\u2028\U0001f400\ud800\ufeff'
 
 
@@ -274,9 +315,13 @@ def largest_lines(limits: LineLimits = DEFAULT_LIMITS) -> dict[str, int]:
 def plain_archive(**options: Any) -> bytes:
     """A valid archive of a small process with names and a view."""
     mdp = TabularMDP.from_successors(
-        np.array([[[0, 1], [1, 2]]] * 3), np.full((3, 2, 2), 0.5), np.arange(12.0).reshape(3, 2, 2),
-        states=("bin", "table", "größe"), actions=("grasp", "place"), **options,
-    )  # fmt: skip
+        np.array([[[0, 1], [1, 2]]] * 3),
+        np.full((3, 2, 2), 0.5),
+        np.arange(12.0).reshape(3, 2, 2),
+        states=("bin", "table", "größe"),
+        actions=("grasp", "place"),
+        **options,
+    )
     with tempfile.TemporaryDirectory() as folder:
         save_mdp(Path(folder) / "m.npz", mdp, np.array([1.0, 0.5, 0.0]))
         return (Path(folder) / "m.npz").read_bytes()
@@ -397,32 +442,100 @@ def crafted_archives() -> dict[str, bytes]:
         {name: _npy(np.zeros(2**16)) for name in arrays}, zipfile.ZIP_DEFLATED
     )
     for shape in (
-        f"({2**70},)", f"({2**32}, {2**32})", f"(0, {2**62})", "(0,)", f"({2**63 - 1},)", "(-1,)",
-        "(3, 2, 3)", "(3, 2)", "(12,)", "()", "(3, 2, 2, 1, 1, 1, 1, 1)", "(" + "1, " * 40 + ")",
+        f"({2**70},)",
+        f"({2**32}, {2**32})",
+        f"(0, {2**62})",
+        "(0,)",
+        f"({2**63 - 1},)",
+        "(-1,)",
+        "(3, 2, 3)",
+        "(3, 2)",
+        "(12,)",
+        "()",
+        "(3, 2, 2, 1, 1, 1, 1, 1)",
+        "(" + "1, " * 40 + ")",
         "(" + "1, " * 900 + ")",
-        "(1e3,)", "(True,)", "((3, 2, 2),)", "[3, 2, 2]", "(3L, 2L, 2L)", "None", "(" + "9" * 3000 + ",)",
-    ):  # fmt: skip
+        "(1e3,)",
+        "(True,)",
+        "((3, 2, 2),)",
+        "[3, 2, 2]",
+        "(3L, 2L, 2L)",
+        "None",
+        "(" + "9" * 3000 + ",)",
+    ):
         features(f"shape {shape[:40]}", _described("'<f8'", shape, bytes(96)))
     # Types.
     for descr in (
-        "'|O'", "'<c16'", "'<c8'", "'|b1'", "'<U2'", "'|S8'", "'|V8'", "'<M8[s]'", "'<m8'", "'<f2'", "'<f4'",
-        "'>f8'", "'<f16'", "'<i8'", "'<u8'", "'|i1'", "'<f3'", "'<q9'", "'<U0'", "'|V0'", f"'<U{2**31}'",
-        "'<U999999999'", "'|S999999999'", "'f'", "'double'", "''", "'<'", "8", "None", "[('a', '<f8')]",
-        "[('a', '|O')]", "{'a': 1}", "'<f8' + '<f8'", "'<f8' '<f8'", "b'<f8'", "'\\x3cf8'", "('<f8', (2,))",
-    ):  # fmt: skip
+        "'|O'",
+        "'<c16'",
+        "'<c8'",
+        "'|b1'",
+        "'<U2'",
+        "'|S8'",
+        "'|V8'",
+        "'<M8[s]'",
+        "'<m8'",
+        "'<f2'",
+        "'<f4'",
+        "'>f8'",
+        "'<f16'",
+        "'<i8'",
+        "'<u8'",
+        "'|i1'",
+        "'<f3'",
+        "'<q9'",
+        "'<U0'",
+        "'|V0'",
+        f"'<U{2**31}'",
+        "'<U999999999'",
+        "'|S999999999'",
+        "'f'",
+        "'double'",
+        "''",
+        "'<'",
+        "8",
+        "None",
+        "[('a', '<f8')]",
+        "[('a', '|O')]",
+        "{'a': 1}",
+        "'<f8' + '<f8'",
+        "'<f8' '<f8'",
+        "b'<f8'",
+        "'\\x3cf8'",
+        "('<f8', (2,))",
+    ):
         features(f"type {descr}", _described(descr, "(3, 2, 2)", bytes(96)))
     for fortran in ("True", "1", "None", "'True'", "[]"):
         features(f"order {fortran}", _described("'<f8'", "(3, 2, 2)", bytes(96), fortran))
     # Headers.
     good = b"{'descr': '<f8', 'fortran_order': False, 'shape': (3, 2, 2), }"
     for header in (
-        b"", b"-" * 9000, b"-" * 4000, b"(" * 4000, b"[" * 60000, b"{" * 4096, b"\x00" * 100, b"\xff" * 100,
-        b"__import__('os')", b"{}", good * 2, good + b"#" * 100, good + b" " * 4000, good + b" " * 60000,
-        good.replace(b"'descr'", b"'Descr'"), good.replace(b"'shape'", b"'descr'"), good[:-1], b" " * 4000,
-        good.replace(b", }", b", 'x': 1}"), good.replace(b": (", b":  \t ("), good.replace(b"'", b'"'),
-        b"{'descr': '<f8'}", good.replace(b"False", b"F" * 4000), b"{" + b"'descr':'<f8'," * 250 + b"}",
+        b"",
+        b"-" * 9000,
+        b"-" * 4000,
+        b"(" * 4000,
+        b"[" * 60000,
+        b"{" * 4096,
+        b"\x00" * 100,
+        b"\xff" * 100,
+        b"__import__('os')",
+        b"{}",
+        good * 2,
+        good + b"#" * 100,
+        good + b" " * 4000,
+        good + b" " * 60000,
+        good.replace(b"'descr'", b"'Descr'"),
+        good.replace(b"'shape'", b"'descr'"),
+        good[:-1],
+        b" " * 4000,
+        good.replace(b", }", b", 'x': 1}"),
+        good.replace(b": (", b":  \t ("),
+        good.replace(b"'", b'"'),
+        b"{'descr': '<f8'}",
+        good.replace(b"False", b"F" * 4000),
+        b"{" + b"'descr':'<f8'," * 250 + b"}",
         good.replace(b"(3, 2, 2)", b"(" + b" " * 3900 + b"3,2,2)"),
-    ):  # fmt: skip
+    ):
         for version in (b"\x01\x00", b"\x02\x00", b"\x03\x00"):
             features(f"header {version!r} {header[:40]!r} {len(header)}", _headed(header, bytes(96), version))
     for magic in (b"", b"\x93", b"\x93NUMPY", b"\x93NUMPY\x04\x00", b"\x93NUMPX\x01\x00", b"PK\x03\x04"):
@@ -433,11 +546,17 @@ def crafted_archives() -> dict[str, bytes]:
     features("one byte more", arrays["features.npy"] + b"\0")
     # Contents.
     for name, array in {
-        "successors": np.full((3, 2, 2), 2**62), "probabilities": np.full((3, 2, 2), np.nan),
-        "features": np.full((3, 2, 2), np.inf), "initial": np.full(3, 1e308), "discount": np.array(np.nan),
-        "available": np.zeros((3, 2), bool), "in_view": np.array([2.0, 0, 0]), "states": np.array(["a"] * 3),
-        "actions": np.array(["grasp", "x" * 10**5]), "feature_names": np.array([["a", "b"]]),
-    }.items():  # fmt: skip
+        "successors": np.full((3, 2, 2), 2**62),
+        "probabilities": np.full((3, 2, 2), np.nan),
+        "features": np.full((3, 2, 2), np.inf),
+        "initial": np.full(3, 1e308),
+        "discount": np.array(np.nan),
+        "available": np.zeros((3, 2), bool),
+        "in_view": np.array([2.0, 0, 0]),
+        "states": np.array(["a"] * 3),
+        "actions": np.array(["grasp", "x" * 10**5]),
+        "feature_names": np.array([["a", "b"]]),
+    }.items():
         found[f"content of {name}"] = _archive({**arrays, f"{name}.npy": _npy(array)})
     found["objects"] = _archive({**arrays, "states.npy": _npy(np.array([{}, [], 1], object))})
     found["text beyond Unicode"] = _archive(
@@ -456,9 +575,17 @@ def crafted_archives() -> dict[str, bytes]:
         for value in values:
             found[f"{what} {value}"] = _patched(base, offset, value)
     for name in (
-        "reward.npy", "features", "features.NPY", "../features.npy", "/etc/passwd", "features.npy/",
-        "x" * 60000, "é.npy", "\x1b[31m.npy", "features.npy.npy",
-    ):  # fmt: skip
+        "reward.npy",
+        "features",
+        "features.NPY",
+        "../features.npy",
+        "/etc/passwd",
+        "features.npy/",
+        "x" * 60000,
+        "é.npy",
+        "\x1b[31m.npy",
+        "features.npy.npy",
+    ):
         found[f"name {name[:20]!r}"] = _archive({**arrays, name: b"\0" * 100})
     for name in arrays:
         found[f"without {name}"] = _archive({k: v for k, v in arrays.items() if k != name})
@@ -545,18 +672,26 @@ def main() -> None:
     tallies["mutated archives"] = fuzz_archives(mutated)
     tallies["crafted archives"] = fuzz_archives(crafted_archives().items())
     rows = [
-        (name, t.inputs, t.read, len(t.problems), t.seconds, 1e6 * t.seconds / max(t.inputs, 1),
-         "" if t.peak < 0 else f"{t.peak / 2**20:.1f}")
+        (
+            name,
+            t.inputs,
+            t.read,
+            len(t.problems),
+            t.seconds,
+            1e6 * t.seconds / max(t.inputs, 1),
+            "" if t.peak < 0 else f"{t.peak / 2**20:.1f}",
+        )
         for name, t in tallies.items()
-    ]  # fmt: skip
+    ]
     print_table(
         "Hostile input", ("reader", "inputs", "read", "problems", "seconds", "µs each", "peak (MiB)"), rows
     )
     peaks = largest_lines()
     print_table(
-        f"Memory of reading one line (limit {DEFAULT_LIMITS.size} characters)", ("line", "peak (MiB)"),
+        f"Memory of reading one line (limit {DEFAULT_LIMITS.size} characters)",
+        ("line", "peak (MiB)"),
         [(name, peak / 2**20) for name, peak in peaks.items()],
-    )  # fmt: skip
+    )
     print(f"The process grew from {before / 1024:.0f} to {resident / 1024:.0f} MiB while reading lines.")
     problems = [f"{name}: {p}" for name, t in tallies.items() for p in t.problems]
     kinds = Counter(p.split(":")[0] for p in problems)

@@ -298,7 +298,7 @@ SQL_DAMAGE = (
     "ALTER TABLE {table} RENAME TO elsewhere",
     "PRAGMA user_version = {b}",
     "PRAGMA application_id = {size}",
-)  # fmt: skip
+)
 _COLUMNS = ("committed", "records", "digest", "demonstration", "state", "chain", "weights", "report")
 _ORIGINS = ("''", "'{}'", "'[1]'", "'null'", "printf('%.*c', 100000, '[')", "'{\"method\": 1}'")
 
@@ -322,11 +322,14 @@ def _damage(path: Path, rng: np.random.Generator, sessions: int) -> str:
     else:
         a, b = (int(i) for i in rng.integers(1, sessions + 1, 2))
         statements = str(rng.choice(SQL_DAMAGE)).format(
-            a=a, b=b, column=rng.choice(_COLUMNS),
+            a=a,
+            b=b,
+            column=rng.choice(_COLUMNS),
             of_state=rng.choice(["session", "sessions", "chain", "tree"]),
-            table=rng.choice(["session", "state", "origin", "writer"]), size=int(rng.integers(0, 20_000)),
+            table=rng.choice(["session", "state", "origin", "writer"]),
+            size=int(rng.integers(0, 20_000)),
             text=rng.choice(_ORIGINS),
-        )  # fmt: skip
+        )
         connection = sqlite3.connect(path)
         connection.executescript(statements)
         connection.close()

@@ -206,9 +206,11 @@ class Forks:
         self._folder = folder
         self._server = subprocess.Popen(
             [sys.executable, "-m", f"{__package__}.kills", "--serve", str(folder)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
             env={k: v for k, v in os.environ.items() if not k.startswith("JAX_")},
-        )  # fmt: skip
+        )
 
     def start(self, arguments: Sequence[str], cached: bool) -> Started:
         """As :data:`Start` says; one at a time."""
@@ -485,7 +487,7 @@ def main() -> None:
         simulate = [*cli, "simulate", "patrol", "--instance", "2", "--sessions", str(options.sessions)]
         with stream.open("w") as file:
             subprocess.run(simulate, stdout=file, check=True)
-        arguments = ["--mdp", "patrol2", "--agent", "0", "--demos", str(stream)]
+        arguments = ["--mdp", "patrol2", "--agent", "0", "--demonstrations", str(stream)]
         survival = survive(arguments, folder, options.kills, seed=options.seed, forked=options.forked)
     kills, sessions = survival.kills, survival.sessions
     columns = ("meant for", "kills", "no new session", "mid-stream", "all learned", "unreported", "sessions")

@@ -139,12 +139,19 @@ METHODS: Mapping[str, Callable[[TabularMDP], Array | np.ndarray]] = {
     "DualProgram": lambda mdp: DualProgram(mdp).solve(target(mdp), SLACK, 0.1).weights,
     "CountProgram": lambda mdp: CountProgram(mdp).solve(counts(), 20 * SLACK, 0.1).weights,
     "PrimalProgram": lambda mdp: PrimalProgram(mdp).solve(target(mdp), SLACK).weights,
-    "MinMaxProgram": lambda mdp: MinMaxProgram(mdp, 2, 6).solve(
-        np.random.default_rng(0).poisson(4.0, (6, 4, 3)), 1.0, 0.1, 0.1, weights=_starts(mdp)
-    ).weights,
-    "fit_weights": lambda mdp: fit_weights(
-        mdp, 5, np.asarray(expected_features(mdp, jnp.asarray(TRUTH / feature_scale(mdp)), 5)), tolerance=1e-9
-    ).weights,
+    "MinMaxProgram": lambda mdp: (
+        MinMaxProgram(mdp, 2, 6)
+        .solve(np.random.default_rng(0).poisson(4.0, (6, 4, 3)), 1.0, 0.1, 0.1, weights=_starts(mdp))
+        .weights
+    ),
+    "fit_weights": lambda mdp: (
+        fit_weights(
+            mdp,
+            5,
+            np.asarray(expected_features(mdp, jnp.asarray(TRUTH / feature_scale(mdp)), 5)),
+            tolerance=1e-9,
+        ).weights
+    ),
     "darko_i2rl": _learned(lambda mdp: darko_i2rl(mdp, radius=2.0)),
     "jin_i2rl_with_features": _learned(jin_i2rl_with_features),
     "mme_mtirl": _learned(lambda mdp: mme_mtirl(mdp, n_components=2, restarts=1, slack=0.01)),
@@ -175,7 +182,7 @@ METHODS: Mapping[str, Callable[[TabularMDP], Array | np.ndarray]] = {
     "rimeo": _learned(lambda mdp: rimeo(mdp, PREDICATES, scores="none"), "noisy"),
     "rimeo ipopt": _learned(lambda mdp: rimeo(mdp, PREDICATES, scores="none", solver="ipopt"), "noisy"),
     "rifom": _learned(lambda mdp: rifom(mdp, PREDICATES, slack=0.01), "noisy"),
-}  # fmt: skip
+}
 # Greedy experts, whose policy is not the soft one.
 GREEDY = ("mlirl", "em_mlirl", "dpm_birl", "birl", "jin_i2rl_with_features")
 # Samplers magnify the least difference: their units are powers of two, which round nothing.
@@ -230,9 +237,12 @@ def random_process(seed: int, kind: str) -> TabularMDP:
     if kind == "duplicate":
         features[..., 2] = features[..., 0]
     mdp = TabularMDP.from_successors(
-        rng.integers(0, 10, (10, 3, 3)), rng.dirichlet(np.ones(3), (10, 3)), features,
-        initial=rng.dirichlet(np.ones(10)), discount=(0.9, 0.95, 0.99)[seed % 3],
-    )  # fmt: skip
+        rng.integers(0, 10, (10, 3, 3)),
+        rng.dirichlet(np.ones(3), (10, 3)),
+        features,
+        initial=rng.dirichlet(np.ones(10)),
+        discount=(0.9, 0.95, 0.99)[seed % 3],
+    )
     return mdp.without_inflow()
 
 

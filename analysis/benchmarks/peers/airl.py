@@ -121,14 +121,14 @@ def main() -> None:
     """Run both sides and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--peer-python", default=None, help="interpreter that has imitation")
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--replications", type=int, default=5)
     arguments = parser.parse_args()
     peer = Peer(arguments.peer_python) if arguments.peer_python else None
     results: dict[str, Any] = {"ours": sys.version.split()[0], "peer": peer.versions if peer else None}
     with tempfile.TemporaryDirectory() as folder:
-        results["hopper"] = _compare(_hopper(), HOPPER, peer, Path(folder), arguments.seeds)
+        results["hopper"] = _compare(_hopper(), HOPPER, peer, Path(folder), arguments.replications)
         results["cart_pole"] = _compare(
-            _cart_pole(), CART_POLE, peer, Path(folder), arguments.seeds, learning_rate=3e-3
+            _cart_pole(), CART_POLE, peer, Path(folder), arguments.replications, learning_rate=3e-3
         )
     if peer:
         peer.close()

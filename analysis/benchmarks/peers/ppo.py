@@ -185,7 +185,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--seeds", type=int, default=5, help="agents of each side on each task")
+    parser.add_argument("--replications", type=int, default=5, help="agents of each side on each task")
     parser.add_argument("--peer-python", type=Path, default=Path(".venv-peers/bin/python"))
     parser.add_argument("--output", type=Path, default=Path("build/bench/ppo_peer.json"))
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
@@ -193,8 +193,8 @@ def main() -> None:
     if options.serve:
         serve()
         return
-    if options.seeds < 2:
-        parser.error(f"an interval needs two seeds or more, got {options.seeds}")
+    if options.replications < 2:
+        parser.error(f"an interval needs two seeds or more, got {options.replications}")
     if not options.peer_python.exists():
         parser.error(f"no interpreter at {options.peer_python}: `make bench-peers` prepares one")
     # taskset and CPU affinity are Linux's; elsewhere the single thread has to do.
@@ -203,7 +203,7 @@ def main() -> None:
         folder, script = Path(name), Path(__file__).with_name("peer_ppo.py")
         ours = Trainer("ours", [sys.executable, "-m", __spec__.name, "--serve"], folder, core)
         peer = Trainer("peer", [str(options.peer_python.absolute()), str(script)], folder, core)
-        rows = [compare(ours, peer, task, options.seeds) for task in options.tasks]
+        rows = [compare(ours, peer, task, options.replications) for task in options.tasks]
         for side in (ours, peer):
             side.close()
     columns = ["task", "steps", "returns", "i2rl", "peer", "difference"]
@@ -219,7 +219,7 @@ def main() -> None:
         for row in rows
         for kind, of in row["returns"].items()
     ]
-    print_table(f"PPO and Stable-Baselines3's, {options.seeds} seeds, 95 % intervals", columns, table)
+    print_table(f"PPO and Stable-Baselines3's, {options.replications} seeds, 95 % intervals", columns, table)
     columns = ["task", "seconds", "peer's", "ratio", "of the processor", "peer's", "ratio", "first round"]
     table = [
         (

@@ -188,7 +188,7 @@ def compare(process: float, variance: float, seed: int, options: Any) -> dict[st
 def main() -> None:
     """Compare, print, publish, and fail where Gibbs differs by more than ``TOLERANCE``."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0] if __doc__ else None)
-    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--replications", type=int, default=4)
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--particles", type=int, default=20_000)
     parser.add_argument("--backward", type=int, default=1500, help="trajectories of half the referee")
@@ -197,7 +197,7 @@ def main() -> None:
     options = parser.parse_args()
     rows, worst = [], 0.0
     for process, variance in SETTINGS:
-        for seed in range(options.seeds):
+        for seed in range(options.replications):
             row = {"process": process, "sensor": variance, "seed": seed}
             row |= compare(process, variance, seed, options)
             rows.append(row)

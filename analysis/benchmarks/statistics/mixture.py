@@ -200,12 +200,16 @@ def agreement(
             data.append(sample(k, setting.mdp, setting.sensor, demonstration))
             spent = time.perf_counter() - began
             varying = [x for x in moments(data[-1]).values() if np.ptp(x) > 0]
-            mixed.append({
-                "mixture": r, "sampler": name, "seconds": spent,
-                "R-hat": max(float(az.rhat(x)) for x in varying),
-                "ESS": min(float(az.ess(x, method="mean")) for x in varying),
-                "components": float(data[-1]["assignments"].n_components.mean()),
-            })  # fmt: skip
+            mixed.append(
+                {
+                    "mixture": r,
+                    "sampler": name,
+                    "seconds": spent,
+                    "R-hat": max(float(az.rhat(x)) for x in varying),
+                    "ESS": min(float(az.ess(x, method="mean")) for x in varying),
+                    "components": float(data[-1]["assignments"].n_components.mean()),
+                }
+            )
         compared += compare(r, *data)
     return compared, mixed
 
@@ -243,9 +247,14 @@ def rank_statistics(
     def true_and_drawn(r: int) -> tuple[dict, dict, int]:
         demonstration = Demonstration.from_codes(np.asarray(drawn.codes[r]))
         problem, *_ = pose(
-            setting.mdp, setting.sensor, demonstration, concentration=setting.concentration,
-            prior=setting.prior, at_least_one={}, warmup=0,
-        )  # fmt: skip
+            setting.mdp,
+            setting.sensor,
+            demonstration,
+            concentration=setting.concentration,
+            prior=setting.prior,
+            at_least_one={},
+            warmup=0,
+        )
         sites = [x[r : r + 1] for x in drawn[:3]]
         known = resolve_jit(resolve_keys[r : r + 1], *sites, problem, drawn.assignment[r : r + 1])
         totals = (known.assignment, known.log_likelihood.sum(-1), known.log_joint)
@@ -316,8 +325,10 @@ def main() -> None:
 
     setting = small_mixture(trajectories=6, length=8, components=10)
     shared = {
-        "components": setting.components, "concentration": setting.concentration, "prior": setting.prior
-    }  # fmt: skip
+        "components": setting.components,
+        "concentration": setting.concentration,
+        "prior": setting.prior,
+    }
     if options.mixtures:
         began = time.perf_counter()
         compared, mixed = agreement(
@@ -329,18 +340,22 @@ def main() -> None:
         )
         spread = tails(compared)
         results["agreement"] = {
-            **spread, "seconds": time.perf_counter() - began, "mixing": mixed,
+            **spread,
+            "seconds": time.perf_counter() - began,
+            "mixing": mixed,
             "compared": [c._asdict() for c in compared],
-        }  # fmt: skip
+        }
         print_table("Chains", tuple(mixed[0]), [tuple(m.values()) for m in mixed])
         print_table(
             f"NUTS and Gibbs: {len(compared)} moments of {options.mixtures} posteriors, furthest apart",
             Comparison._fields,
             sorted(compared, key=lambda c: -abs(c.z))[:6],
         )
-        print_table("Differences in standard errors", ("", "value"), [
-            (name, value) for name, value in spread.items() if name != "largest z"
-        ])  # fmt: skip
+        print_table(
+            "Differences in standard errors",
+            ("", "value"),
+            [(name, value) for name, value in spread.items() if name != "largest z"],
+        )
         publish("mixture", results)
 
     setting = small_mixture(trajectories=5, length=6, components=5)
@@ -365,12 +380,14 @@ def main() -> None:
         tests = uniformity(ranks)
         least = min(test.p_value for test in tests)
         results["calibration"][name] = {
-            "draws": ranks.draws, "divergences": ranks.divergences,
+            "draws": ranks.draws,
+            "divergences": ranks.divergences,
             "quantities": [test._asdict() for test in tests],
-            "smallest p": least, "chance of one as small": 1 - (1 - least) ** len(tests),
+            "smallest p": least,
+            "chance of one as small": 1 - (1 - least) ** len(tests),
             "seconds": time.perf_counter() - began,
             "ranks": {q: column.tolist() for q, column in zip(ranks.names, ranks.ranks.T, strict=True)},
-        }  # fmt: skip
+        }
         print_table(
             f"{name}: ranks of the truth, {options.replications} replications "
             f"({results['calibration'][name]['seconds']:.0f} s)",

@@ -58,10 +58,10 @@ WIDTHS = (5, 8, 10, 12, 14, 20, 40)
 SHARES = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5])
 
 
-def learn(patrol: Patrol, runs: int, sessions: int, seed: int) -> dict[str, np.ndarray]:
+def learn(patrol: Patrol, replications: int, sessions: int, seed: int) -> dict[str, np.ndarray]:
     """Reports of all streams: log-likelihoods and gradients ``[R, T]``, weights ``[R, T, K]``."""
     key, start = jax.random.key(seed), jax.random.key(seed + 1)
-    rows = [demonstrate(k, patrol, PERCENT, sessions, STEPS)[0] for k in jax.random.split(key, runs)]
+    rows = [demonstrate(k, patrol, PERCENT, sessions, STEPS)[0] for k in jax.random.split(key, replications)]
     streams = Demonstration(*(np.stack(parts)[:, :, None] for parts in zip(*rows, strict=True)))
     learner = lme_i2rl(patrol.mdp, patrol.visibility(PERCENT))
     _, reports = run_streams(learner, start, streams)
@@ -83,47 +83,76 @@ def histories(patrol: Patrol, reports: dict[str, np.ndarray]) -> Histories:
     mapped = jax.jit(lambda w: jax.lax.map(one, w))(jnp.asarray(weights).reshape(-1, weights.shape[-1]))
     greedy, error, accuracy = (np.asarray(x) for x in mapped)
     return Histories(
-        reports["log_likelihood"], reports["gradient"], greedy.reshape(*shape, -1).astype(np.int8),
-        error.reshape(shape), accuracy.reshape(shape),
-    )  # fmt: skip
+        reports["log_likelihood"],
+        reports["gradient"],
+        greedy.reshape(*shape, -1).astype(np.int8),
+        error.reshape(shape),
+        accuracy.reshape(shape),
+    )
 
 
 def sweeps(h: Histories, margin: float) -> dict[str, Sweep]:
     """Every rule over its tolerances."""
-    runs, sessions = h.accuracy.shape
+    replications, sessions = h.accuracy.shape
     scale = float(h.error.max())
 
     def swept(name: str, unit: str, rule: Callable[[float], np.ndarray], rho: np.ndarray) -> Sweep:
         return sweep_tolerance(name, unit, rule, rho, h.accuracy, margin, TAIL)
 
     rows = [
-        swept("criterion 1: single step of likelihood", "nats",
-              partial(likelihood_change, h.log_likelihood), TOLERANCES),
-        swept("criterion 2: single step of learning error", "value",
-              partial(learning_error_change, h.error), TOLERANCES * scale),
+        swept(
+            "criterion 1: single step of likelihood",
+            "nats",
+            partial(likelihood_change, h.log_likelihood),
+            TOLERANCES,
+        ),
+        swept(
+            "criterion 2: single step of learning error",
+            "value",
+            partial(learning_error_change, h.error),
+            TOLERANCES * scale,
+        ),
         swept("single step of gradient", "nats", partial(likelihood_change, h.gradient), TOLERANCES),
-        swept("fixed number of sessions", "sessions", lambda n: np.full(runs, int(n)),
-              np.unique(np.geomspace(1, sessions, 60).round())),
-    ]  # fmt: skip
+        swept(
+            "fixed number of sessions",
+            "sessions",
+            lambda n: np.full(replications, int(n)),
+            np.unique(np.geomspace(1, sessions, 60).round()),
+        ),
+    ]
     for width in WIDTHS:
         rows += [
-            swept(f"likelihood, window of {width}", "nats",
-                  partial(moving_window, h.log_likelihood, width), TOLERANCES),
-            swept(f"gradient, window of {width}", "nats",
-                  partial(moving_window, h.gradient, width), TOLERANCES),
-            swept(f"policy, window of {width}", "share of states",
-                  partial(policy_window, h.greedy, width), SHARES),
-        ]  # fmt: skip
+            swept(
+                f"likelihood, window of {width}",
+                "nats",
+                partial(moving_window, h.log_likelihood, width),
+                TOLERANCES,
+            ),
+            swept(
+                f"gradient, window of {width}", "nats", partial(moving_window, h.gradient, width), TOLERANCES
+            ),
+            swept(
+                f"policy, window of {width}",
+                "share of states",
+                partial(policy_window, h.greedy, width),
+                SHARES,
+            ),
+        ]
     return {one.name: one for one in rows}
 
 
 def _told(v: Verdict) -> dict[str, Any]:
     low, high = v.interval()
     return {
-        "false stops": v.false_stops, "false rate": v.false_rate, "interval": [low, high], "stops": v.stops,
-        "mean sessions": float(v.used.mean()), "median sessions": float(np.median(v.used)),
-        "saved": v.saved, "accuracy given away": v.loss,
-    }  # fmt: skip
+        "false stops": v.false_stops,
+        "false rate": v.false_rate,
+        "interval": [low, high],
+        "stops": v.stops,
+        "mean sessions": float(v.used.mean()),
+        "median sessions": float(np.median(v.used)),
+        "saved": v.saved,
+        "accuracy given away": v.loss,
+    }
 
 
 def _ratios(single: Sweep, window: Sweep) -> dict[str, float]:
@@ -133,12 +162,16 @@ def _ratios(single: Sweep, window: Sweep) -> dict[str, float]:
 
 
 DRAWN = (
-    "criterion 1: single step of likelihood", "criterion 2: single step of learning error",
-    "likelihood, window of 10", "likelihood, window of 20", "gradient, window of 10", "policy, window of 10",
-)  # fmt: skip
+    "criterion 1: single step of likelihood",
+    "criterion 2: single step of learning error",
+    "likelihood, window of 10",
+    "likelihood, window of 20",
+    "gradient, window of 10",
+    "policy, window of 10",
+)
 
 
-def _tell(every: dict[str, Sweep], sessions: int, runs: int) -> None:
+def _tell(every: dict[str, Sweep], sessions: int, replications: int) -> None:
     """Print the rules at three tolerances, and false stops of single step and windows at all of them."""
     columns = ("rule", "rho", "false stops", "stops", "mean sessions", "median", "saved")
     rows = []
@@ -148,7 +181,10 @@ def _tell(every: dict[str, Sweep], sessions: int, runs: int) -> None:
             v, rho = one.verdicts[i], f"{one.rho[i]:.2g} {one.unit}"
             used = (float(v.used.mean()), float(np.median(v.used)), f"{v.saved:.0%}")
             rows.append((name, rho, v.false_stops, v.stops, *used))
-    title = f"{runs} streams of {sessions} sessions; a false stop is {100 * MARGIN:g} points of LBA too early"
+    title = (
+        f"{replications} streams of {sessions} sessions; "
+        f"a false stop is {100 * MARGIN:g} points of LBA too early"
+    )
     print_table(title, columns, rows)
     names = ["criterion 1: single step of likelihood", *(f"likelihood, window of {w}" for w in WIDTHS)]
     print_table(
@@ -161,22 +197,26 @@ def _tell(every: dict[str, Sweep], sessions: int, runs: int) -> None:
     )
 
 
-def _draw(every: dict[str, Sweep], sessions: int, runs: int, folder: Path) -> None:
+def _draw(every: dict[str, Sweep], sessions: int, replications: int, folder: Path) -> None:
     note = (
         "a point a tolerance; bands: 95 % Wilson intervals; false: more than "
         f"{100 * MARGIN:g} points of LBA below what the stream settles at"
     )
     save_themes(
         lambda theme: stopping_plot(
-            [every[name] for name in DRAWN], control=every["fixed number of sessions"], theme=theme,
-            title=f"Stopping rules on {runs} streams of {sessions} sessions", note=note,
+            [every[name] for name in DRAWN],
+            control=every["fixed number of sessions"],
+            theme=theme,
+            title=f"Stopping rules on {replications} streams of {sessions} sessions",
+            note=note,
         ),
-        folder, "stopping",
-    )  # fmt: skip
+        folder,
+        "stopping",
+    )
 
 
 def main(
-    runs: Annotated[int, typer.Option(help="Streams.")] = 200,
+    replications: Annotated[int, typer.Option(help="Streams.")] = 200,
     sessions: Annotated[int, typer.Option(help="Sessions per stream.")] = 240,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     reuse: Annotated[bool, typer.Option(help="Judge the streams of the last run again.")] = False,
@@ -188,17 +228,20 @@ def main(
     if reuse:
         with np.load(kept) as arrays:
             reports = dict(arrays)
-        runs, sessions = reports["log_likelihood"].shape
+        replications, sessions = reports["log_likelihood"].shape
     else:
-        reports = learn(patrol, runs, sessions, seed)
+        reports = learn(patrol, replications, sessions, seed)
         kept.parent.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(kept, **reports)  # type: ignore[arg-type]
     h = histories(patrol, reports)
     settled = h.accuracy[:, -TAIL:].mean(1)
     results: dict[str, Any] = {
-        "runs": runs, "sessions": sessions, "seed": seed, "tail": TAIL,
+        "replications": replications,
+        "sessions": sessions,
+        "seed": seed,
+        "tail": TAIL,
         "settled accuracy": [float(x) for x in np.quantile(settled, [0, 0.5, 1])],
-    }  # fmt: skip
+    }
     for margin in (0.02, MARGIN, 0.1):
         every = sweeps(h, margin)
         single = every["criterion 1: single step of likelihood"]
@@ -214,8 +257,8 @@ def main(
             },
         }
         if margin == MARGIN:
-            _tell(every, sessions, runs)
-            _draw(every, sessions, runs, path.parent)
+            _tell(every, sessions, replications)
+            _draw(every, sessions, replications, path.parent)
     results["seconds"] = time.perf_counter() - began
     publish(path.stem, results, path)
 

@@ -235,7 +235,7 @@ def _mountain_car(plan: Plan) -> Case:
         200,
         (("position", "velocity (a step)"), (0, 1)),
         plan,
-    )  # fmt: skip
+    )
 
 
 # -- onions -------------------------------------------------------------------------------------------

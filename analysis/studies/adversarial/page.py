@@ -51,9 +51,7 @@ TABLE_7_4 = {
     "half-cheetah": {CLEAN: 0.96, NOISY: 0.86, ROBUST: 0.94, SSRR: 0.87},
 }
 """Pearson's correlation of learned and true rewards."""
-TABLE_7_5 = {
-    CLEAN: (0.907, 0.726, 0.199), NOISY: (0.889, 0.625, 0.297), ROBUST: (0.843, 0.637, 0.243)
-}  # fmt: skip
+TABLE_7_5 = {CLEAN: (0.907, 0.726, 0.199), NOISY: (0.889, 0.625, 0.297), ROBUST: (0.843, 0.637, 0.243)}
 """``V_demo``, ``V_gen`` and empirical ILE, on data of 64 dimensions that were never released."""
 LBA_LOST = {"patrol": 0.20, "mountain-car": 0.22}
 """Relative drop of LBA by noise (section 7.4.3)."""
@@ -71,15 +69,17 @@ def learning_table(results: AdversarialResults) -> Table:
     printed = TABLE_7_3.get(results.domain)
     measures = [m for m in ("accuracy", "returns") if any(_has(r, m) for r in results.methods.values())]
     heads = {"accuracy": "LBA, %", "returns": "return"}
-    headings = ["method", "seeds", *(heads[m] for m in measures)] + ["dissertation"] * (printed is not None)
+    headings = ["method", "replications", *(heads[m] for m in measures)] + ["dissertation"] * (
+        printed is not None
+    )
     rows: list[list[str]] = []
     if results.expert_return is not None and "returns" in measures:
         cells = {"accuracy": "100", "returns": f"{results.expert_return:,.{_digits(results.expert_return)}f}"}
         rows.append([EXPERT, _NONE, *(cells[m] for m in measures)])
     for name in results.methods:
         late = {m: results.late(name, m) for m in measures}
-        seeds = max((len(x) for x in late.values() if x is not None), default=0)
-        rows.append([name, f"{seeds}", *(_late(late[m], m) for m in measures)])
+        replications = max((len(x) for x in late.values() if x is not None), default=0)
+        rows.append([name, f"{replications}", *(_late(late[m], m) for m in measures)])
     if printed is not None:
         for row in rows:
             row.append(f"{printed[row[0]]:,}" if row[0] in printed else _NONE)
@@ -89,7 +89,7 @@ def learning_table(results: AdversarialResults) -> Table:
     return Table(
         headings,
         rows,
-        f"Mean of the last {kept} of {counted(sessions, 'session')} (95 % interval over seeds)."
+        f"Mean of the last {kept} of {counted(sessions, 'session')} (95 % interval over replications)."
         + "".join(
             f" {name} learned from as much in {counted(len(results.methods[name].pairs), 'session')}."
             for name in fewer
@@ -124,7 +124,7 @@ def recovery_table(results: AdversarialResults) -> Table:
         ("", "measured", "dissertation"),
         rows,
         f"Lost: (clean - noisy) / clean of mean {measure}. Won back: (robust - noisy) / (clean - noisy), "
-        "with a 95 % interval by drawing seeds with replacement, which of few seeds is too narrow.",
+        "with a 95 % interval by drawing seeds with replacement, which of few replications is too narrow.",
     )
 
 
@@ -141,15 +141,25 @@ def correlation_table(results: AdversarialResults) -> Table:
             cells += [f"{sum(c.n for c in found):,}", *_correlated(found)]
         rows.append((*cells, f"{printed[name]:.2f}" if name in printed else _NONE))
     return Table(
-        ("method", "seeds", "steps", "Pearson", "Spearman", "trajectories", "Pearson", "Spearman",
-         "dissertation"),
+        (
+            "method",
+            "replications",
+            "steps",
+            "Pearson",
+            "Spearman",
+            "trajectories",
+            "Pearson",
+            "Spearman",
+            "dissertation",
+        ),
         rows,
         "Learned against true reward on held-out episodes of a mix of policies, from the expert's to a "
         "uniform one; trajectories by their sums, over equally long episodes unless the task itself ends "
-        "them. Mean over seeds and Student's 95 % interval (of one seed: drawing whole trajectories with "
+        "them. Mean over replications and Student's 95 % interval (of one seed: a bootstrap of "
+        "trajectories with "
         "replacement); none where a reward is the same in all steps. The dissertation's (Table 7.4, Pearson) "
         "come with p-values that fit 4 to 7 points each.",
-    )  # fmt: skip
+    )
 
 
 def ile_table(results: AdversarialResults) -> Table:
@@ -189,10 +199,10 @@ def breach_table(results: AdversarialResults) -> Table:
             told = _NONE if printed is None else f"{100 * printed[0]:.0f} to {100 * printed[1]:.0f}"
             rows.append((name, f"{len(result.breaches)}", _percent_with_interval(result.breaches), told))
     return Table(
-        ("method", "seeds", "breaches that succeed, %", "dissertation"),
+        ("method", "replications", "breaches that succeed, %", "dissertation"),
         rows,
         "With what was learned in the last session, or the expert's own policy, for all patrollers; 95 % "
-        "interval over seeds.",
+        "interval over replications.",
     )
 
 
@@ -206,10 +216,14 @@ def _has(result: MethodResult, measure: str) -> bool:
     return getattr(result, measure) is not None
 
 
-def _late(runs: Float[np.ndarray, " seeds"] | None, measure: str) -> str:
-    if runs is None:
+def _late(replications: Float[np.ndarray, " replications"] | None, measure: str) -> str:
+    if replications is None:
         return _NONE
-    return _percent_with_interval(runs) if measure == "accuracy" else _with_interval(runs, 1, _digits(runs))
+    return (
+        _percent_with_interval(replications)
+        if measure == "accuracy"
+        else _with_interval(replications, 1, _digits(replications))
+    )
 
 
 def _digits(returns: Any) -> int:
@@ -217,18 +231,18 @@ def _digits(returns: Any) -> int:
     return 0 if np.abs(returns).max() >= 100 else 2
 
 
-def _percent_with_interval(shares: Float[np.ndarray, " seeds"]) -> str:
-    """Student's interval of a few seeds knows nothing of the ends of a scale."""
+def _percent_with_interval(shares: Float[np.ndarray, " replications"]) -> str:
+    """Student's interval of a few replications knows nothing of the ends of a scale."""
     return _with_interval(shares, 100, within=(0, 100))
 
 
 def _with_interval(
-    runs: Float[np.ndarray, " seeds"],
+    replications: Float[np.ndarray, " replications"],
     scale: float = 1.0,
     digits: int = 1,
     within: tuple[float, float] = (-math.inf, math.inf),
 ) -> str:
-    band = seed_interval(scale * np.asarray(runs, float))
+    band = seed_interval(scale * np.asarray(replications, float))
     if np.isnan(band.mean):
         return _NONE
     if np.isnan(band.low):
@@ -300,7 +314,7 @@ def summary(results: AdversarialResults) -> dict[str, Any]:
     return {
         "domain": results.domain,
         "noise": results.noise,
-        "seeds": results.seeds,
+        "replications": results.replications,
         "machine": results.machine,
         "settings": dict(results.settings),
         "accuracy over": results.accuracy_over,
@@ -405,12 +419,12 @@ def _lead(all_results: Sequence[AdversarialResults]) -> Lead:
             trust.append(
                 f"in {name} {_recovered(found)} of what noise cost is won back"
                 if known
-                else f"in {name} these runs do not show that noise cost anything"
+                else f"in {name} these replications do not show that noise cost anything"
             )
-    seeds = min(results.seeds for results in all_results)
-    few = f"Trust no difference as long as there is {counted(seeds, 'seed')} only"
-    if seeds > 1:
-        few = f"Trust differences beyond the spread of {counted(seeds, 'seed')}"
+    replications = min(results.replications for results in all_results)
+    few = f"Trust no difference as long as there is {counted(replications, 'replication')} only"
+    if replications > 1:
+        few = f"Trust differences beyond the spread of {counted(replications, 'replication')}"
     return Lead(
         "Rewards were learned as networks, so there are no weights to list; after the last sessions they "
         f"reach {'; '.join(learned)}.",
@@ -450,7 +464,8 @@ _NOTES = {
 def _text(results: AdversarialResults) -> str:
     told = (
         f"The expert's states and actions are reported with noise: {results.noise}. "
-        f"{counted(results.seeds, 'independent seed')}; all methods of a seed see the same demonstrations "
+        f"{counted(results.replications, 'independent replication')}; "
+        "all methods of a seed see the same demonstrations "
         "and have equal budgets."
     )
     return "\n\n".join([told, *([_NOTES[results.domain]] if results.domain in _NOTES else [])])
@@ -463,44 +478,49 @@ def _sections(results: AdversarialResults, folder: Path) -> list[Section]:
         return drawn(folder, f"{results.domain}-{name}", draw, told, description)
 
     learning = picture(
-        "learning", partial(figures.learning_plot, results),
+        "learning",
+        partial(figures.learning_plot, results),
         "Learning against the pairs seen (Figures 7.11 to 7.13). Axes need not begin at zero.",
         "Learned behaviour accuracy or return against reported pairs, a line a method",
-    )  # fmt: skip
+    )
     first = [tables[name] for name in ("recovery", "breaches", "errors") if name in tables]
     sections = [Section(results.title, _text(results), first, [learning])]
     if results.cells:
         cells = picture(
-            "cells", partial(figures.cells_plot, results.cells, *_MOUNTAIN_CAR),
-            "LBA in each cell of the space of states, mean over seeds; many cells are never visited.",
+            "cells",
+            partial(figures.cells_plot, results.cells, *_MOUNTAIN_CAR),
+            "LBA in each cell of the space of states, mean over replications; many cells are never visited.",
             "Maps of position and velocity shaded by the share of actions equal to the expert's",
-        )  # fmt: skip
+        )
         sections.append(Section(f"{results.title}: where", "", [], [cells]))
     if "rewards" in tables or results.scatters:
         pictures = []
         if results.scatters:
             title = f"Learned and true rewards, {results.title}"
             scatter = picture(
-                "rewards", partial(figures.scatter_plot, results.scatters, title=title),
+                "rewards",
+                partial(figures.scatter_plot, results.scatters, title=title),
                 "Learned against true rewards of the first seed. A learned reward has its own scale.",
                 "Learned reward against true reward, a panel a method",
-            )  # fmt: skip
+            )
             pictures.append(scatter)
         rewards = [tables["rewards"]] if "rewards" in tables else []
         sections.append(Section(f"{results.title}: rewards", "", rewards, pictures))
     if results.belief is not None:
         belief = picture(
-            "belief", partial(figures.belief_plot, results.belief),
+            "belief",
+            partial(figures.belief_plot, results.belief),
             "A noisy trajectory as robust-AIRL of the first seed understands it in the end.",
             "Reports, truth and posterior band of a trajectory's components against time",
-        )  # fmt: skip
+        )
         sections.append(Section(f"{results.title}: what is believed of the truth", "", [], [belief]))
     if results.frames:
         frames = picture(
-            "frames", partial(figures.frames_plot, results.frames),
+            "frames",
+            partial(figures.frames_plot, results.frames),
             "Moments of an episode of the expert and of what was learned, from the same kind of start.",
             "Rows of silhouettes of the robot at even times",
-        )  # fmt: skip
+        )
         sections.append(Section(f"{results.title}: motion", "", [], [frames]))
     if "pace" in tables:
         sections.append(Section(f"{results.title}: time", "", [tables["pace"]]))

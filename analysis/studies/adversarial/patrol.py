@@ -72,7 +72,7 @@ def confusions_of(patrol: Patrol, forward_as_left: float, right_as_forward: floa
     return Confusions.of_actions(patrol.mdp.n_states, kinds, chances, patrol.mdp.n_actions)
 
 
-def noisy_streams(patrol: Patrol, level: float, runs: int, sessions: int, seed: int = 0) -> Streams:
+def noisy_streams(patrol: Patrol, level: float, replications: int, sessions: int, seed: int = 0) -> Streams:
     """Reports of the patroller's greedy expert; the truth is the same at every level."""
     confusions = confusions_of(patrol, level, level)
     sensor = Sensor(None, confusions.noise)
@@ -83,11 +83,13 @@ def noisy_streams(patrol: Patrol, level: float, runs: int, sessions: int, seed: 
         states, actions = simulate(act, patrol.mdp, log_policy, STEPS)
         return states, actions, observe(look, sensor, states, actions)
 
-    keys = jax.random.split(jax.random.key(seed), runs * sessions * MOST)
+    keys = jax.random.split(jax.random.key(seed), replications * sessions * MOST)
     states, actions, codes = jax.jit(partial(jax.lax.map, one, batch_size=64))(keys)
-    # Sizes are those of all runs, so that curves share their axis.
+    # Sizes are those of all replications, so that curves share their axis.
     sizes = np.random.default_rng(seed).integers(LEAST, MOST + 1, sessions)
-    there = np.broadcast_to((np.arange(MOST) < sizes[:, None])[..., None], (runs, sessions, MOST, STEPS))
+    there = np.broadcast_to(
+        (np.arange(MOST) < sizes[:, None])[..., None], (replications, sessions, MOST, STEPS)
+    )
 
     def shaped(demonstration: Demonstration) -> Demonstration:
         arrays = (np.asarray(x).reshape(there.shape) for x in demonstration)
@@ -162,15 +164,19 @@ def success_rates(
     for i, policy in enumerate(policies):
         both = jnp.broadcast_to(jnp.log(jnp.asarray(policy)), (patrol.patrollers, *policy.shape))
         outcome = breach_trials(
-            jax.random.fold_in(jax.random.key(seed), i), patrol, both, observability=100,
-            observed_steps=STEPS, trials=trials,
-        )  # fmt: skip
+            jax.random.fold_in(jax.random.key(seed), i),
+            patrol,
+            both,
+            observability=100,
+            observed_steps=STEPS,
+            trials=trials,
+        )
         rates.append(outcome.rate())
     return np.array(rates)
 
 
 def interval(values: Float[np.ndarray, "R ..."]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over runs, and half the width of its 95 % interval (Student), zero for one run."""
+    """Mean over replications, and half the width of its 95 % interval (Student), zero for one run."""
     band = seed_interval(values)
     return band.mean, np.nan_to_num(band.high - band.mean)
 
@@ -188,7 +194,7 @@ class _Run(NamedTuple):
 
 
 def patrol_results(
-    seeds: int,
+    replications: int,
     sessions: int | None = None,
     noise: float = 1.0,
     *,
@@ -200,7 +206,7 @@ def patrol_results(
 
     Parameters
     ----------
-    seeds : int
+    replications : int
     sessions : int, optional
         35 by default.
     noise : float
@@ -218,7 +224,7 @@ def patrol_results(
         For fewer than one seed, session or trial, and for noise that makes no probability of the confusions.
     """
     sessions = SESSIONS if sessions is None else sessions
-    for count, what in ((seeds, "seed"), (sessions, "session"), (trials, "trial of a breach")):
+    for count, what in ((replications, "seed"), (sessions, "session"), (trials, "trial of a breach")):
         if operator.index(count) < 1:
             raise ValueError(f"there must be at least one {what}, got {count}")
     if not 0 < noise * LEVEL <= 1:
@@ -227,7 +233,7 @@ def patrol_results(
             f"most {1 / LEVEL:g}; got {noise}"
         )
     level, patrol = noise * LEVEL, instance(2)
-    streams = noisy_streams(patrol, level, seeds, sessions)
+    streams = noisy_streams(patrol, level, replications, sessions)
     learners = {
         name: make(memory=0.0, iterations=iterations)
         for name, make in noise_learners(patrol, streams.sensor).items()
@@ -236,29 +242,29 @@ def patrol_results(
     methods, noises, first = {}, [], np.zeros(0)
     for i, (name, learner) in enumerate(learners.items()):
         given = streams.truth if name == CLEAN else streams.seen
-        runs = []
-        for seed in range(seeds):
-            runs.append(_run(patrol, learner, Demonstration(*(x[seed] for x in given)), seed))
-            share = (i + (seed + 1) / seeds) / len(learners)
-            advance(f"{name}, seed {seed}: LBA {runs[-1].accuracy[-1]:.1%}", share)
-        policies = np.array([greedy_policy_of(patrol.mdp, r.state) for r in runs])
+        repeats = []
+        for seed in range(replications):
+            repeats.append(_run(patrol, learner, Demonstration(*(x[seed] for x in given)), seed))
+            share = (i + (seed + 1) / replications) / len(learners)
+            advance(f"{name}, seed {seed}: LBA {repeats[-1].accuracy[-1]:.1%}", share)
+        policies = np.array([greedy_policy_of(patrol.mdp, r.state) for r in repeats])
         methods[name] = MethodResult(
             streams.pairs,
-            np.array([r.accuracy for r in runs]),
+            np.array([r.accuracy for r in repeats]),
             breaches=success_rates(patrol, policies, trials),
-            seconds=float(np.median([r.seconds[1:] for r in runs])) if sessions > 1 else None,
+            seconds=float(np.median([r.seconds[1:] for r in repeats])) if sessions > 1 else None,
         )
         if name == ROBUST:
-            first = np.exp(np.asarray(runs[0].state.log_policy))
+            first = np.exp(np.asarray(repeats[0].state.log_policy))
         if name == LEARNED:
-            noises = [r.noise.tolist() for r in runs]
-    true = np.broadcast_to(patrol.expert_policy(), (seeds, *first.shape))
+            noises = [r.noise.tolist() for r in repeats]
+    true = np.broadcast_to(patrol.expert_policy(), (replications, *first.shape))
     percent = f"{100 * level:.3g} %"
     return AdversarialResults(
         "patrol",
         f"moving forward is reported as turning left, and turning right as moving forward, {percent} of the "
         "time each; states are reported rightly",
-        seeds,
+        replications,
         "",
         methods,
         accuracy_over=f"all {patrol.mdp.n_states} states",
@@ -294,7 +300,7 @@ def believed_trajectories(results: AdversarialResults) -> Sequence[tuple[Strip, 
     None if no report errs in 64 sessions.
     """
     patrol, level = instance(2), results.settings[MISREPORT]
-    streams = noisy_streams(patrol, level, runs=1, sessions=64, seed=1)
+    streams = noisy_streams(patrol, level, replications=1, sessions=64, seed=1)
     wrong = (streams.seen.action != streams.truth.action).any(-1)
     if not wrong.any():
         return ()

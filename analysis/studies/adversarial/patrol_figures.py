@@ -34,8 +34,12 @@ from .patrol import interval
 Results = Mapping[str, Mapping[str, Any]]
 
 CLEAN, NOISY, ROBUST, LEARNED, LME = (
-    "AIRL, clean input", "AIRL, noisy input", "robust-AIRL", "robust-AIRL, sensor learned", "LME-I2RL",
-)  # fmt: skip
+    "AIRL, clean input",
+    "AIRL, noisy input",
+    "robust-AIRL",
+    "robust-AIRL, sensor learned",
+    "LME-I2RL",
+)
 GAIL, ROBUST_GAIL = "online GAIL", "GAIL, hidden steps in expectation"
 LAST = 15
 # Section 7.4.3: success of AIRL and of robust-AIRL on noisy reports, 95 % ranges.
@@ -67,11 +71,12 @@ def noise_curves(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     shown = {label: h for p in panels for h, label in zip(*p.get_legend_handles_labels(), strict=True)}
     title = f"Patrol, {level:.0%} of forward moves and right turns misreported"
     head(figure, theme, list(shown.values()), title=title)
-    runs = max(len(r["accuracy"]) for r in results["noise"].values() if "accuracy" in r)
+    replications = max(len(r["accuracy"]) for r in results["noise"].values() if "accuracy" in r)
     foot(
         figure,
         theme,
-        f"line: mean of {counted(runs, 'run')}; band: its 95% interval; the axis does not begin at zero",
+        f"line: mean of {counted(replications, 'replication')}; band: its 95% interval; "
+        "the axis does not begin at zero",
     )
     return figure
 
@@ -111,10 +116,12 @@ def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     handles = left.get_legend_handles_labels()[0]
     head(figure, theme, handles, title="What misreports cost on patrol", columns=2)
     foot(
-        figure, theme,
-        "point: mean over runs; bar: its 95% interval; grey: range in the dissertation; the left axis does "
+        figure,
+        theme,
+        "point: mean over replications; bar: its 95% interval; grey: range in the dissertation; "
+        "the left axis does "
         "not begin at zero",
-    )  # fmt: skip
+    )
     return figure
 
 
@@ -185,9 +192,11 @@ def view_curves(results: Results, theme: Theme, gail_memory: float = 0.0) -> Fig
     panels[0, 0].set_ylabel("learned behaviour accuracy\n(share of states)", color=theme.ink, fontsize=TEXT)
     panels[1, 0].set_ylabel("accuracy lost against a full view\n(share)", color=theme.ink, fontsize=TEXT)
     head(
-        figure, theme, panels[0, 0].get_legend_handles_labels()[0],
+        figure,
+        theme,
+        panels[0, 0].get_legend_handles_labels()[0],
         title="Patrol through a keyhole: online GAIL beside LME-I2RL",
-    )  # fmt: skip
+    )
     foot(
         figure,
         theme,
@@ -224,8 +233,10 @@ def _required(one: Mapping[str, Any] | None) -> Mapping[str, Any]:
     return one
 
 
-def _draw_mean(axes: Axes, style: Mapping[str, Any], name: str, x: np.ndarray, runs: np.ndarray) -> None:
-    mean, half = interval(runs)
+def _draw_mean(
+    axes: Axes, style: Mapping[str, Any], name: str, x: np.ndarray, replications: np.ndarray
+) -> None:
+    mean, half = interval(replications)
     top = np.minimum(mean + half, 1.0)
     axes.fill_between(x, mean - half, top, color=style["color"], alpha=0.18, linewidth=0)
     every = max(len(x) // 7, 1)

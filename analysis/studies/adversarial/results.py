@@ -40,39 +40,43 @@ LEARNED = "robust-AIRL, sensor learned"
 METHODS = (CLEAN, NOISY, ROBUST, SSRR, LEARNED)
 
 DOMAINS = {
-    "patrol": "Patrol", "mountain-car": "Mountain car", "hopper": "Hopper", "walker2d": "Walker2d",
-    "half-cheetah": "HalfCheetah", "onion": "Onion sorting, continuous",
-}  # fmt: skip
+    "patrol": "Patrol",
+    "mountain-car": "Mountain car",
+    "hopper": "Hopper",
+    "walker2d": "Walker2d",
+    "half-cheetah": "HalfCheetah",
+    "onion": "Onion sorting, continuous",
+}
 """Names on the command line, and on the page."""
 
 _DRAWN_STEPS = 1500
 
 
 class MethodResult(NamedTuple):
-    """One method on all seeds.
+    """One method on all replications.
 
     Fields
     ------
     pairs : int ``[T]``
         Reported state-action pairs seen after each session.
-    accuracy : float ``[seeds, T]`` or None
+    accuracy : float ``[replications, T]`` or None
         LBA in [0, 1], over the states that :attr:`AdversarialResults.accuracy_over` says.
-    returns : float ``[seeds, T]`` or None
+    returns : float ``[replications, T]`` or None
         Mean true return of the learned policy after each session.
     correlations : RewardCorrelation a seed, after the last session; or none
     errors : EmpiricalILE a seed, after the last session; or none
-    breaches : float ``[seeds]`` or None
+    breaches : float ``[replications]`` or None
         Share of breaches of the patrol that succeed with what was learned in the end.
     seconds : float or None
         Median of a session, once compiled.
     """
 
     pairs: Int[np.ndarray, " T"]
-    accuracy: Float[np.ndarray, "seeds T"] | None = None
-    returns: Float[np.ndarray, "seeds T"] | None = None
+    accuracy: Float[np.ndarray, "replications T"] | None = None
+    returns: Float[np.ndarray, "replications T"] | None = None
     correlations: tuple[RewardCorrelation, ...] = ()
     errors: tuple[EmpiricalILE, ...] = ()
-    breaches: Float[np.ndarray, " seeds"] | None = None
+    breaches: Float[np.ndarray, " replications"] | None = None
     seconds: float | None = None
 
     @property
@@ -142,7 +146,7 @@ class AdversarialResults(NamedTuple):
     ------
     domain : one of :data:`DOMAINS`
     noise : str, the sensor in words ("normal, covariance 0.05 I")
-    seeds : int
+    replications : int
     machine : str, where seconds were measured
     methods : mapping from a name of :data:`METHODS` to MethodResult
     accuracy_over : str, the states of LBA in words
@@ -150,7 +154,8 @@ class AdversarialResults(NamedTuple):
     scatters : mapping from a method's name to RewardScatter, of one seed
     belief : Belief or None
     frames : FrameStrip a row
-    cells : mapping from a method's name to LBA in each cell ``[cells, cells]`` of mountain car, mean of seeds
+    cells : mapping from a method's name to LBA in each cell ``[cells, cells]`` of mountain car, mean of
+    replications
     settings : mapping from words to plain values, for the file
     expert_breaches : float or None
         Share of breaches of the patrol that succeed with the expert's own policy.
@@ -158,7 +163,7 @@ class AdversarialResults(NamedTuple):
 
     domain: str
     noise: str
-    seeds: int
+    replications: int
     machine: str
     methods: Mapping[str, MethodResult]
     accuracy_over: str = "all states"
@@ -180,18 +185,22 @@ class AdversarialResults(NamedTuple):
         """What noise is said to cost: ``"accuracy"`` (LBA) of few actions, ``"returns"`` of vectors."""
         return "accuracy" if self.domain in ("patrol", "mountain-car") else "returns"
 
-    def late(self, method: str, measure: str) -> Float[np.ndarray, " seeds"] | None:
+    def late(self, method: str, measure: str) -> Float[np.ndarray, " replications"] | None:
         """A method's measure averaged over the last quarter of its sessions, None where there is none."""
         result = self.methods.get(method)
-        runs = None if result is None else getattr(result, measure)
-        return None if result is None or runs is None else np.asarray(runs)[:, result.late].mean(1)
+        replications = None if result is None else getattr(result, measure)
+        return (
+            None
+            if result is None or replications is None
+            else np.asarray(replications)[:, result.late].mean(1)
+        )
 
     def recovery(self, method: str = ROBUST) -> Recovery | None:
         """Share of what noise cost that a method recovers, None without all three methods."""
-        runs = [self.late(name, self.measure) for name in (CLEAN, NOISY, method)]
-        if any(x is None for x in runs):
+        replications = [self.late(name, self.measure) for name in (CLEAN, NOISY, method)]
+        if any(x is None for x in replications):
             return None
-        clean, noisy, robust = runs
+        clean, noisy, robust = replications
         return recovered_share(clean, noisy, robust, jax.random.key(0))  # type: ignore[arg-type]
 
 
@@ -260,10 +269,17 @@ def frame_strip(
 _KINDS = {
     kind.__name__: kind
     for kind in (
-        AdversarialResults, MethodResult, RewardScatter, Belief, FrameStrip, Correlation, EmpiricalILE,
-        Interval, RewardCorrelation,
+        AdversarialResults,
+        MethodResult,
+        RewardScatter,
+        Belief,
+        FrameStrip,
+        Correlation,
+        EmpiricalILE,
+        Interval,
+        RewardCorrelation,
     )
-}  # fmt: skip
+}
 
 
 def store_results(results: AdversarialResults, path: Path | str) -> None:

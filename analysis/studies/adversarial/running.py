@@ -17,12 +17,12 @@ __all__ = ["answer", "print_tables", "summary", "write"]
 
 def answer(
     domain: str,
-    seeds: int = 1,
+    replications: int = 1,
     sessions: int | None = None,
     noise: float = 1.0,
     *,
     workers: int = 1,
-    kept: Path | None = None,
+    cache: Path | None = None,
     advance: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> AdversarialResults:
     """The study of a task with ``noise`` times its own noise. Raises ``ValueError`` for noise of zero, and
@@ -33,7 +33,7 @@ def answer(
     if domain == "patrol":
         from .patrol import patrol_results
 
-        results = patrol_results(seeds, sessions, noise, advance=advance)
+        results = patrol_results(replications, sessions, noise, advance=advance)
         return results._replace(machine=_machine())
     if domain not in PLANS:
         raise ValueError(f"the domain is one of patrol, {', '.join(PLANS)}; got {domain!r}")
@@ -41,7 +41,7 @@ def answer(
     if sessions is not None:
         plan = plan._replace(sessions=sessions)
     return adversarial_study.adversarial_study(
-        domain, seeds, plan, workers=workers, folder=kept, machine=_machine(), advance=advance
+        domain, replications, plan, workers=workers, folder=cache, machine=_machine(), advance=advance
     )
 
 

@@ -255,12 +255,12 @@ def _belief(of: Case, policy: Any, truth: Recording, reported: Recording) -> Bel
 _SHOWN_STEPS = 100
 
 
-# -- all seeds and methods ----------------------------------------------------------------------------
+# -- all replications and methods ----------------------------------------------------------------------------
 
 
 def adversarial_study(
     name: str,
-    seeds: int = 5,
+    replications: int = 5,
     plan: Plan | None = None,
     methods: Sequence[str] = STUDIED,
     *,
@@ -269,37 +269,39 @@ def adversarial_study(
     machine: str = "",
     advance: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> AdversarialResults:
-    """All seeds of all methods on one task.
+    """All replications of all methods on one task.
 
     Runs found in ``folder`` are not run again, and new ones are kept there. Raises ``ValueError`` for another
     name than :data:`~i2rl.analysis.studies.adversarial.cases.PLANS` has, and for fewer than one seed or
     session.
     """
-    if seeds < 1:
-        raise ValueError(f"there must be at least one seed, got {seeds}")
+    if replications < 1:
+        raise ValueError(f"there must be at least one seed, got {replications}")
     of = case(name, plan)
     if of.plan.sessions < 1:
         raise ValueError(f"there must be at least one session, got {of.plan.sessions}")
-    wanted = [(method, seed) for seed in range(seeds) for method in methods]
+    wanted = [(method, seed) for seed in range(replications) for method in methods]
     outcomes = {}
     for done, (which, outcome) in enumerate(_all_runs(name, wanted, of.plan, workers, folder)):
         outcomes[which] = outcome
         method, seed = which
         advance(f"{method}, seed {seed}: return {outcome.returns[-1]:.0f}", (done + 1) / len(wanted))
-    by_method = {m: [outcomes[m, seed] for seed in range(seeds)] for m in methods}
-    shown = {m: runs[0] for m, runs in by_method.items()}
+    by_method = {m: [outcomes[m, seed] for seed in range(replications)] for m in methods}
+    shown = {m: repeats[0] for m, repeats in by_method.items()}
     return AdversarialResults(
         name,
         of.noise,
-        seeds,
+        replications,
         machine,
-        {m: _result(runs) for m, runs in by_method.items()},
+        {m: _result(repeats) for m, repeats in by_method.items()},
         accuracy_over=of.accuracy_over,
         expert_return=of.expert_return,
         scatters={m: outcome.scatter for m, outcome in shown.items()},
         belief=shown[ROBUST].belief if ROBUST in shown else None,
         frames=_frames(name, shown),
-        cells={m: np.mean([r.cells for r in runs], 0) for m, runs in by_method.items()} if of.cells else {},
+        cells={m: np.mean([r.cells for r in repeats], 0) for m, repeats in by_method.items()}
+        if of.cells
+        else {},
         settings=_settings(of.plan, by_method),
     )
 
@@ -312,23 +314,23 @@ def _frames(name: str, shown: Mapping[str, Outcome]) -> tuple[FrameStrip, ...]:
     return (expert, *(frame_strip(m, robot, outcome.episode) for m, outcome in shown.items()))
 
 
-def _settings(plan: Plan, runs: Mapping[str, Sequence[Outcome]]) -> dict[str, Any]:
+def _settings(plan: Plan, repeats: Mapping[str, Sequence[Outcome]]) -> dict[str, Any]:
     """For the file: the plan, the budget of each method, and what was learned of the sensor."""
     told = {**{k: v for k, v in plan._asdict().items() if k != "settings"}, **dict(plan.settings)}
-    told["environment steps"] = {m: int(outcomes[0].steps[-1]) for m, outcomes in runs.items()}
-    if LEARNED in runs:
-        told["learned sensor, a row a seed"] = [o.sensor[-1].tolist() for o in runs[LEARNED]]
+    told["environment steps"] = {m: int(outcomes[0].steps[-1]) for m, outcomes in repeats.items()}
+    if LEARNED in repeats:
+        told["learned sensor, a row a seed"] = [o.sensor[-1].tolist() for o in repeats[LEARNED]]
     return told
 
 
-def _result(runs: Sequence[Outcome]) -> MethodResult:
+def _result(repeats: Sequence[Outcome]) -> MethodResult:
     return MethodResult(
-        runs[0].pairs,
-        np.array([r.accuracy for r in runs]),
-        np.array([r.returns for r in runs]),
-        tuple(r.scatter.correlation for r in runs),
-        tuple(r.error for r in runs),
-        seconds=float(np.median([r.seconds[1:] for r in runs])) if len(runs[0].seconds) > 1 else None,
+        repeats[0].pairs,
+        np.array([r.accuracy for r in repeats]),
+        np.array([r.returns for r in repeats]),
+        tuple(r.scatter.correlation for r in repeats),
+        tuple(r.error for r in repeats),
+        seconds=float(np.median([r.seconds[1:] for r in repeats])) if len(repeats[0].seconds) > 1 else None,
     )
 
 

@@ -62,9 +62,15 @@ def draw_world(study: LabelBiasStudy, theme: Theme) -> Figure:
         axes.plot(c[0] + offset, r[0] + offset, color=style["color"], marker=style["marker"], markersize=6)
         reward = float(study.trajectories.reward[path])
         handles.append(
-            Line2D([], [], color=style["color"], linestyle=style["linestyle"], marker=style["marker"],
-                   label=f"earns {number(reward)}, BIRL {float(study.trajectories.birl[path]):.1f} nats")
-        )  # fmt: skip
+            Line2D(
+                [],
+                [],
+                color=style["color"],
+                linestyle=style["linestyle"],
+                marker=style["marker"],
+                label=f"earns {number(reward)}, BIRL {float(study.trajectories.birl[path]):.1f} nats",
+            )
+        )
     dress(axes, theme, x="column (cells)", y="row (cells)", grid=None)
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), aspect="equal")
     axes.set_xticks(range(columns))
@@ -93,9 +99,14 @@ def draw_scatter(study: LabelBiasStudy, theme: Theme) -> Figure:
     ):
         style = method_styles(theme, [name])[name]
         axes.plot(
-            reward + (spread if name == "BIRL" else 0), np.asarray(likelihood), linestyle="", markersize=5,
-            marker=style["marker"], color=style["color"], alpha=0.6,
-        )  # fmt: skip
+            reward + (spread if name == "BIRL" else 0),
+            np.asarray(likelihood),
+            linestyle="",
+            markersize=5,
+            marker=style["marker"],
+            color=style["color"],
+            alpha=0.6,
+        )
         p = tell_p(found.p)
         title = (
             f"{name}: no correlation, one of the two is constant"
@@ -160,15 +171,31 @@ def draw_settings(study: LabelBiasStudy, theme: Theme) -> Figure:
     name_ticks(axes, "y", range(len(study.results)), [r.setting.name for r in study.results], fontsize=SMALL)
     axes.set(ylim=(len(study.results) - 0.5, -0.5), xlim=(-1.05, 1.05))
     handles = [
-        Line2D([], [], linestyle="", marker=birl["marker"], markersize=4, color=birl["color"],
-               label="BIRL, a world"),
-        Line2D([], [], linestyle="", marker="|", markersize=12, markeredgewidth=2.4, color=theme.ink,
-               label="BIRL, median"),
-        Line2D([], [], linestyle="", marker=maxent["marker"], color=maxent["color"],
-               label="MaxEnt, all worlds"),
+        Line2D(
+            [],
+            [],
+            linestyle="",
+            marker=birl["marker"],
+            markersize=4,
+            color=birl["color"],
+            label="BIRL, a world",
+        ),
+        Line2D(
+            [],
+            [],
+            linestyle="",
+            marker="|",
+            markersize=12,
+            markeredgewidth=2.4,
+            color=theme.ink,
+            label="BIRL, median",
+        ),
+        Line2D(
+            [], [], linestyle="", marker=maxent["marker"], color=maxent["color"], label="MaxEnt, all worlds"
+        ),
         band,
         printed,
-    ]  # fmt: skip
+    ]
     head(figure, theme, handles, title="What the correlation depends on", columns=3)
     return figure
 

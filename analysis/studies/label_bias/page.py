@@ -35,17 +35,19 @@ def _rows(study: LabelBiasStudy) -> list[dict[str, Any]]:
     for result in study.results:
         low, median, high = quantiles(result.birl)
         deviations = np.abs(1 - result.maxent[np.isfinite(result.maxent)])
-        rows.append({
-            "setting": result.setting.name,
-            "worlds with a correlation": int(np.isfinite(result.birl).sum()),
-            "BIRL median rho": median,
-            "BIRL rho, 5 % and 95 % of worlds": [low, high],
-            "share significant": result.significant.value,
-            "share significant, 95 % interval": list(result.significant[1:]),
-            "share significantly negative": result.negative.value,
-            "median rho of choices met": quantiles(result.choice)[1],
-            "MaxEnt largest |1 - rho|": float(np.max(deviations, initial=0.0)),
-        })  # fmt: skip
+        rows.append(
+            {
+                "setting": result.setting.name,
+                "worlds with a correlation": int(np.isfinite(result.birl).sum()),
+                "BIRL median rho": median,
+                "BIRL rho, 5 % and 95 % of worlds": [low, high],
+                "share significant": result.significant.value,
+                "share significant, 95 % interval": list(result.significant[1:]),
+                "share significantly negative": result.negative.value,
+                "median rho of choices met": quantiles(result.choice)[1],
+                "MaxEnt largest |1 - rho|": float(np.max(deviations, initial=0.0)),
+            }
+        )
     return rows
 
 
@@ -243,19 +245,31 @@ def write(study: LabelBiasStudy, folder: Path | str) -> Path:
     pictures = [
         drawn(folder, name, partial(draw, study), caption, description)
         for name, draw, caption, description in (
-            ("world", figures.draw_world,
-             "The median world: walls, the two objects, and trajectories from the least reward to the most.",
-             "Grid with walls, two objects in opposite corners, and five paths"),
-            ("scatter", figures.draw_scatter,
-             "Log-likelihood against total reward of the median world's trajectories.",
-             "Two scatter plots: no clear relation for BIRL, a straight line for MaxEnt"),
-            ("settings", figures.draw_settings,
-             "Correlation in every world, setting by setting, and the dissertation's one.",
-             "Correlations of BIRL from minus one to one depending on the setting; of MaxEnt always one"),
-            ("sweep", figures.draw_sweep,
-             "Correlation against how sharply experts choose (and are believed to choose).",
-             "BIRL's correlation falls from positive to minus one with eta where blocked moves stay"),
+            (
+                "world",
+                figures.draw_world,
+                "Median world: walls, the two objects, and trajectories from the least reward to the most.",
+                "Grid with walls, two objects in opposite corners, and five paths",
+            ),
+            (
+                "scatter",
+                figures.draw_scatter,
+                "Log-likelihood against total reward of the median world's trajectories.",
+                "Two scatter plots: no clear relation for BIRL, a straight line for MaxEnt",
+            ),
+            (
+                "settings",
+                figures.draw_settings,
+                "Correlation in every world, setting by setting, and the dissertation's one.",
+                "Correlations of BIRL from minus one to one depending on the setting; of MaxEnt always one",
+            ),
+            (
+                "sweep",
+                figures.draw_sweep,
+                "Correlation against how sharply experts choose (and are believed to choose).",
+                "BIRL's correlation falls from positive to minus one with eta where blocked moves stay",
+            ),
         )
-    ]  # fmt: skip
+    ]
     section = Section("What the correlation depends on", _text(study), _tables(study)[1:], pictures)
     return write_page(folder, "Label bias (Table 5.1)", _lead(study), [section], summary(study))

@@ -66,14 +66,24 @@ def bits_by_bout(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
         ends = np.array([p.bits.sum() / seen[-1] for p in order])
         for p, end, y in zip(order, ends, _spread(ends, 0.052 * (high - low)), strict=True):
             axes.annotate(
-                for_figure(f"{p.method}  {end:.3f}"), (bouts[-1], end), (1.04, y),
-                textcoords=("axes fraction", "data"), va="center", color=theme.ink, fontsize=SMALL,
-                annotation_clip=False, fontweight="bold" if p.method == LEARNER else "normal",
+                for_figure(f"{p.method}  {end:.3f}"),
+                (bouts[-1], end),
+                (1.04, y),
+                textcoords=("axes fraction", "data"),
+                va="center",
+                color=theme.ink,
+                fontsize=SMALL,
+                annotation_clip=False,
+                fontweight="bold" if p.method == LEARNER else "normal",
                 arrowprops={
-                    "arrowstyle": "-", "shrinkA": 0, "shrinkB": 1, "relpos": (0, 0.5),
-                    "color": styles[p.method]["color"], "linestyle": styles[p.method]["linestyle"],
+                    "arrowstyle": "-",
+                    "shrinkA": 0,
+                    "shrinkB": 1,
+                    "relpos": (0, 0.5),
+                    "color": styles[p.method]["color"],
+                    "linestyle": styles[p.method]["linestyle"],
                 },
-            )  # fmt: skip
+            )
     headline(figure, theme, result.recording)
     foot(figure, theme, "each bout predicted before it is learned from")
     return figure
@@ -166,15 +176,28 @@ def draw_maze(
         low, high = position[hidden].min(0) - 1.0, position[hidden].max(0) + 1.0
         style: dict[str, Any] = {"edgecolor": theme.muted, "linewidth": 0.0, "hatch": "//"}
         axes.add_patch(Rectangle(tuple(low), *(high - low), facecolor=theme.surface, alpha=0.45, **style))
-        axes.text((low[0] + high[0]) / 2, high[1] + 0.4, "out of view", ha="center", va="bottom",
-                  color=theme.ink, fontsize=TEXT)  # fmt: skip
+        axes.text(
+            (low[0] + high[0]) / 2,
+            high[1] + 0.4,
+            "out of view",
+            ha="center",
+            va="bottom",
+            color=theme.ink,
+            fontsize=TEXT,
+        )
     port, home = position[WATER_PORT], position[HOME]
     axes.plot(*port, "o", markersize=8, markerfacecolor=theme.goal, markeredgecolor=theme.surface)
     axes.plot(*home, "s", markersize=9, markerfacecolor=theme.surface, markeredgecolor=theme.ink)
     for place, name in ((port, "water"), (home, "home")):
         axes.annotate(
-            name, place, (0, -12), textcoords="offset points", ha="center", va="top", color=theme.ink,
+            name,
+            place,
+            (0, -12),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            color=theme.ink,
             fontsize=TEXT,
-        )  # fmt: skip
+        )
     axes.set(xlim=(-16, 16), ylim=(-19, 17), aspect="equal")
     axes.axis("off")

@@ -50,16 +50,18 @@ def summary(result: LabyrinthStudy) -> dict[str, Any]:
             "intervals": None if (found := _estimates(result, view)) is None else found.summary(),
             "values": dict(zip(mdp.state_names, view.learned.values.tolist(), strict=True)),
         }
-    told: dict[str, Any] = plain({
-        "provenance": study_provenance(0),
-        "recording": result.recording,
-        "bouts": len(result.decisions),
-        "decisions": int(result.decisions.sum()),
-        "decisions_of_each_bout": result.decisions.tolist(),
-        "discount": float(mdp.discount),
-        "ridge": result.ridge,
-        "views": views,
-    })  # fmt: skip
+    told: dict[str, Any] = plain(
+        {
+            "provenance": study_provenance(0),
+            "recording": result.recording,
+            "bouts": len(result.decisions),
+            "decisions": int(result.decisions.sum()),
+            "decisions_of_each_bout": result.decisions.tolist(),
+            "discount": float(mdp.discount),
+            "ridge": result.ridge,
+            "views": views,
+        }
+    )
     return told
 
 
@@ -81,14 +83,16 @@ def tables(result: LabyrinthStudy) -> list[Table]:
             score = bits_per_decision(p.bits, result.decisions)
             delta = bits_per_decision(p.bits - first.bits, result.decisions)
             apart = p is not first
-            rows.append((
-                p.method,
-                f"{score.estimate:.3f} ({score.low:.3f} to {score.high:.3f})",
-                f"{delta.estimate:+.3f} ({delta.low:+.3f} to {delta.high:+.3f})" if apart else "-",
-                *([f"{p.bits_out_of_view.sum() / outside:.3f}"] if outside else []),
-                f"{p.afterwards:.3f}",
-                p.parameters,
-            ))  # fmt: skip
+            rows.append(
+                (
+                    p.method,
+                    f"{score.estimate:.3f} ({score.low:.3f} to {score.high:.3f})",
+                    f"{delta.estimate:+.3f} ({delta.low:+.3f} to {delta.high:+.3f})" if apart else "-",
+                    *([f"{p.bits_out_of_view.sum() / outside:.3f}"] if outside else []),
+                    f"{p.afterwards:.3f}",
+                    p.parameters,
+                )
+            )
         hidden = ["on hidden decisions"] if outside else []
         made.append(
             Table(
@@ -180,17 +184,21 @@ def write(result: LabyrinthStudy, folder: Path | str) -> Path:
 
     pictures = [
         drawn(
-            folder, "bits", lambda theme: bits_by_bout(result, theme),
+            folder,
+            "bits",
+            lambda theme: bits_by_bout(result, theme),
             "Running bits per decision, each bout predicted before it is learned from; lower is better.",
             "Bits per decision against bouts, a line a method",
         ),
         drawn(
-            folder, "value", lambda theme: value_on_maze(result, theme),
+            folder,
+            "value",
+            lambda theme: value_on_maze(result, theme),
             "Learned value of every place, entered from above: orange ones are worth less than zero, blue "
             "ones more. The maze is drawn as its environment draws it, home below.",
             "The maze with every corridor shaded by the learned value of the place it leads to",
         ),
-    ]  # fmt: skip
+    ]
     sections = [Section("Prediction", _text(result), tables(result), pictures)]
     return write_page(
         folder, f"What the mouse {result.recording} seeks", _lead(result), sections, summary(result)

@@ -127,7 +127,7 @@ class MethodsStudy(NamedTuple):
 
     patrol: Patrol
     sessions: int
-    runs: int
+    replications: int
     seed: int
     points: Int[np.ndarray, " points"]
     curves: tuple[MethodCurve, ...]
@@ -161,13 +161,13 @@ def methods_study(
     number: int = 2,
     *,
     sessions: int = 120,
-    runs: int = 3,
+    replications: int = 3,
     seed: int = 0,
     learning_rates: Sequence[float] = RATES,
     methods: Sequence[str] | None = None,
     advance: Advance = lambda description, fraction: None,
 ) -> MethodsStudy:
-    """Run every method on the same fully observed patrols, ``runs`` times with each patroller a stream.
+    """Run every method ``replications`` times on the same fully observed patrols, a stream a patroller.
 
     A stream is ``sessions`` windows of five pairs. Windows are the sessions of all methods but DARKO, whose
     sessions end at the goals (:func:`turning_places`); what it learned at the last goal counts until the
@@ -183,7 +183,7 @@ def methods_study(
         raise ValueError(f"methods are {'; '.join(entries)}; got {unknown[0]!r}")
     entries = {name: entry for name, entry in entries.items() if methods is None or name in methods}
     points = np.unique(np.geomspace(1, sessions, 24).round().astype(int)) * PAIRS_PER_SESSION
-    streams = _streams(jax.random.key(seed), patrol, sessions, runs)
+    streams = _streams(jax.random.key(seed), patrol, sessions, replications)
     tuning = _streams(jax.random.key(seed + _TUNING), patrol, sessions, 1)
     curves, sweeps = [], {}
     for i, (name, entry) in enumerate(entries.items()):
@@ -207,7 +207,7 @@ def methods_study(
     return MethodsStudy(
         patrol,
         sessions,
-        runs,
+        replications,
         seed,
         points,
         tuple(curves),
@@ -244,11 +244,13 @@ def chosen_learning_rate(learning_rates: Sequence[float], scores: Float[np.ndarr
     return min(float(learning_rate) for learning_rate, kept in zip(learning_rates, good, strict=True) if kept)
 
 
-def _streams(key: Array, patrol: Patrol, sessions: int, runs: int) -> list[tuple[Array, Demonstration]]:
+def _streams(
+    key: Array, patrol: Patrol, sessions: int, replications: int
+) -> list[tuple[Array, Demonstration]]:
     """A key for the first weights, and the windows, of every patroller of every run."""
     return [
         (jax.random.fold_in(one, p), windows)
-        for one in jax.random.split(key, runs)
+        for one in jax.random.split(key, replications)
         for p, windows in enumerate(demonstrate(one, patrol, 100, sessions, PAIRS_PER_SESSION))
     ]
 
@@ -328,28 +330,30 @@ def _family(name: str) -> str:
 
 def summary(study: MethodsStudy) -> dict[str, Any]:
     """Settings, curves, sweeps and the live Table 8.1 as plain data."""
-    told: dict[str, Any] = plain({
-        "provenance": study_provenance(study.seed),
-        "patrol": study.patrol.name,
-        "sessions": study.sessions,
-        "runs": study.runs,
-        "seed": study.seed,
-        "pairs": study.points.tolist(),
-        "methods": [
-            {
-                "method": curve.name,
-                "learning rate": curve.learning_rate,
-                "median accuracy": np.median(curve.accuracy, axis=0).tolist(),
-                "pairs to 90 %": _pairs_to(study, curve, 0.9),
-                "weights": curve.weights,
-            }
-            for curve in study.curves
-        ],
-        "sweeps": {name: scores.tolist() for name, scores in study.sweeps.items()},
-        "table 8.1": study.table.to_dict("records"),
-        "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
-        "weights, first stream": None if (found := _estimates(study)) is None else found.summary(),
-    })  # fmt: skip
+    told: dict[str, Any] = plain(
+        {
+            "provenance": study_provenance(study.seed),
+            "patrol": study.patrol.name,
+            "sessions": study.sessions,
+            "replications": study.replications,
+            "seed": study.seed,
+            "pairs": study.points.tolist(),
+            "methods": [
+                {
+                    "method": curve.name,
+                    "learning rate": curve.learning_rate,
+                    "median accuracy": np.median(curve.accuracy, axis=0).tolist(),
+                    "pairs to 90 %": _pairs_to(study, curve, 0.9),
+                    "weights": curve.weights,
+                }
+                for curve in study.curves
+            ],
+            "sweeps": {name: scores.tolist() for name, scores in study.sweeps.items()},
+            "table 8.1": study.table.to_dict("records"),
+            "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
+            "weights, first stream": None if (found := _estimates(study)) is None else found.summary(),
+        }
+    )
     return told
 
 
@@ -378,11 +382,14 @@ def _tables(study: MethodsStudy) -> tuple[Table, ...]:
     for curve in study.curves:
         band = quantile_band(curve.accuracy[:, -1])
         reached = _pairs_to(study, curve, 0.9)
-        results.append((
-            curve.name, "-" if curve.learning_rate is None else f"{curve.learning_rate:g}",
-            "never" if reached is None else f"{reached}",
-            f"{100 * band.median:.1f} % ({100 * band.low:.0f}-{100 * band.high:.0f})",
-        ))  # fmt: skip
+        results.append(
+            (
+                curve.name,
+                "-" if curve.learning_rate is None else f"{curve.learning_rate:g}",
+                "never" if reached is None else f"{reached}",
+                f"{100 * band.median:.1f} % ({100 * band.low:.0f}-{100 * band.high:.0f})",
+            )
+        )
     sweep = [(name, *(f"{score:.3f}" for score in scores)) for name, scores in study.sweeps.items()]
     live = [tuple(row) for row in study.table.itertuples(index=False)]
     return (
@@ -469,9 +476,11 @@ def print_tables(study: MethodsStudy, console: Console) -> None:
 def write(study: MethodsStudy, folder: Path | str) -> Path:
     """Write the page: ``index.html``, the picture in both themes, and ``results.json``."""
     picture = drawn(
-        folder, "methods", partial(draw, study),
+        folder,
+        "methods",
+        partial(draw, study),
         "Accuracy of the learned behaviour against the number of state-action pairs seen.",
         "Learned behaviour accuracy of each online method against pairs seen, on a logarithmic axis",
-    )  # fmt: skip
+    )
     section = Section("Methods compared", _TEXT, _tables(study), [picture])
     return write_page(folder, _title(study), _lead(study), [section], summary(study))

@@ -49,50 +49,56 @@ TARGETS = {PLAIN: (1 / 6, 1 / 12), AVERAGED: (1 / 12, 1 / 24), STEPWISE: (1 / 12
 
 def summary(study: NoisyStudy) -> dict[str, Any]:
     """Settings and all measures as plain data."""
-    told: dict[str, Any] = plain({
-        "provenance": study_provenance(study.seed),
-        "task": study.task.name,
-        "starts": study.starts,
-        "runs": study.runs,
-        "sessions": study.sessions,
-        "trajectories a session": TRAJECTORIES,
-        "steps": STEPS,
-        "seed": study.seed,
-        "true agreement": dict(zip(study.task.predicate_names, study.true_agreement.tolist(), strict=True)),
-        "divergence of one half": study.control,
-        "methods": [
-            {
-                "method": name,
-                "runs": len(result.weights),
-                "weights": result.weights[:, -1],
-                "sessions": result.sessions.tolist(),
-                "divergence": _described(result.divergence if _quotable(study, name) else None),
-                "accuracy": {states: _described(result.accuracy[..., i]) for i, states in enumerate(STATES)},
-            }
-            for name, result in study.results.items()
-        ],
-        "hidden": None
-        if study.hidden is None
-        else {name: _described(result.accuracy[..., 0]) for name, result in study.hidden.items()},
-        "seconds a session": dict(study.seconds),
-        "identified": {method: doubt.known for method, doubt in study.doubt.items()},
-        "reliabilities": None
-        if study.posterior is None
-        else {
-            "features": list(study.posterior.names),
-            "trajectories": study.posterior.trajectories,
-            "posterior mean": study.posterior.draws.mean(0).tolist(),
-            "learned": study.posterior.learned.tolist(),
-            "truth": study.posterior.truth.tolist(),
-            "in these reports": study.posterior.happened.tolist(),
-            "divergent transitions": study.posterior.divergences,
-        },
-        "features": list(study.task.mdp.feature_names),
-        "true weights": study.task.weights,
-        "reward, first run": None if (found := _reward(study)) is None else found,
-        "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
-        "belts": None if study.belts is None else sorting_table_summary(study.belts),
-    })  # fmt: skip
+    told: dict[str, Any] = plain(
+        {
+            "provenance": study_provenance(study.seed),
+            "task": study.task.name,
+            "starts": study.starts,
+            "replications": study.replications,
+            "sessions": study.sessions,
+            "trajectories a session": TRAJECTORIES,
+            "steps": STEPS,
+            "seed": study.seed,
+            "true agreement": dict(
+                zip(study.task.predicate_names, study.true_agreement.tolist(), strict=True)
+            ),
+            "divergence of one half": study.control,
+            "methods": [
+                {
+                    "method": name,
+                    "replications": len(result.weights),
+                    "weights": result.weights[:, -1],
+                    "sessions": result.sessions.tolist(),
+                    "divergence": _described(result.divergence if _quotable(study, name) else None),
+                    "accuracy": {
+                        states: _described(result.accuracy[..., i]) for i, states in enumerate(STATES)
+                    },
+                }
+                for name, result in study.results.items()
+            ],
+            "hidden": None
+            if study.hidden is None
+            else {name: _described(result.accuracy[..., 0]) for name, result in study.hidden.items()},
+            "seconds a session": dict(study.seconds),
+            "identified": {method: doubt.known for method, doubt in study.doubt.items()},
+            "reliabilities": None
+            if study.posterior is None
+            else {
+                "features": list(study.posterior.names),
+                "trajectories": study.posterior.trajectories,
+                "posterior mean": study.posterior.draws.mean(0).tolist(),
+                "learned": study.posterior.learned.tolist(),
+                "truth": study.posterior.truth.tolist(),
+                "in these reports": study.posterior.happened.tolist(),
+                "divergent transitions": study.posterior.divergences,
+            },
+            "features": list(study.task.mdp.feature_names),
+            "true weights": study.task.weights,
+            "reward, first run": None if (found := _reward(study)) is None else found,
+            "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
+            "belts": None if study.belts is None else sorting_table_summary(study.belts),
+        }
+    )
     return told
 
 
@@ -119,10 +125,12 @@ def _reward(study: NoisyStudy) -> list[dict[str, Any]] | None:
     ]
 
 
-def _described(runs: Float[np.ndarray, "runs T"] | None) -> dict[str, list[float | None]] | None:
-    if runs is None:
+def _described(
+    replications: Float[np.ndarray, "replications T"] | None,
+) -> dict[str, list[float | None]] | None:
+    if replications is None:
         return None
-    band = mean_interval(runs)
+    band = mean_interval(replications)
     return {
         name: [None if math.isnan(x) else x for x in values.tolist()]
         for name, values in zip(("mean", "low", "high"), band, strict=True)
@@ -132,8 +140,10 @@ def _described(runs: Float[np.ndarray, "runs T"] | None) -> dict[str, list[float
 # -- tables -------------------------------------------------------------------------------------------
 
 
-def _with_interval(runs: Float[np.ndarray, " runs"], scale: float = 1.0, digits: int = 1) -> str:
-    band = mean_interval(scale * np.asarray(runs))
+def _with_interval(
+    replications: Float[np.ndarray, " replications"], scale: float = 1.0, digits: int = 1
+) -> str:
+    band = mean_interval(scale * np.asarray(replications))
     if np.isnan(band.low):
         return f"{band.mean:.{digits}f}"
     return f"{band.mean:.{digits}f} ({band.low:.{digits}f}-{band.high:.{digits}f})"
@@ -160,18 +170,24 @@ def sensor_table(study: NoisyStudy) -> Table:
         rows.append(tuple(cells))  # type: ignore[arg-type]
     return Table(
         (
-            "estimate", f"after {early}", "of one half", "at most",
-            f"after {late}", "of one half", "at most",
+            "estimate",
+            f"after {early}",
+            "of one half",
+            "at most",
+            f"after {late}",
+            "of one half",
+            "at most",
         ),
         rows,
         "Kullback-Leibler divergence of the learned agreement probabilities from the true ones in nats, mean "
-        "over predicates, after so many sessions: mean of runs (95 % interval). At most: shares to reach "
+        "over predicates, after so many sessions: mean of replications (95 % interval). "
+        "At most: shares to reach "
         "after 6 and 20 sessions of all starts.",
-    )  # fmt: skip
+    )
 
 
 def _identified(study: NoisyStudy, method: str) -> bool:
-    """Whether the sensor is known in at least half of the runs; what was not asked is not doubted."""
+    """Whether the sensor is known in at least half of the replications; what was not asked is not doubted."""
     return method not in study.doubt or study.doubt[method].known >= 0.5
 
 
@@ -196,10 +212,17 @@ def doubt_table(study: NoisyStudy) -> Table:
                 )
             )
     return Table(
-        ("learner", "predicate", "if the expert errs", "if he is decided", "truth", "runs identified"),
+        (
+            "learner",
+            "predicate",
+            "if the expert errs",
+            "if he is decided",
+            "truth",
+            "replications identified",
+        ),
         rows,
         "Agreement of reports with the truth, fitted to all reports of a run under the reward it learned, "
-        "for an expert as erratic as was learned and for one who always does what is best; mean of runs "
+        "for an expert as erratic as was learned and for one who always acts optimally; mean of replications "
         "(95 % interval). Where the two are more than 0.05 apart, reports do not say whose the errors are.",
     )
 
@@ -213,10 +236,11 @@ def behaviour_table(study: NoisyStudy) -> Table:
         for name, result in study.results.items()
     ]
     return Table(
-        ("method", "runs", *headings),
+        ("method", "replications", *headings),
         rows,
         f"LBA after {study.sessions} sessions: share of states in which the greedy action is one of the "
-        "expert's optimal ones; mean of runs (95 % interval). Choice: more than one action is available; "
+        "expert's optimal ones; mean of replications (95 % interval). "
+        "Choice: more than one action is available; "
         "reachable: from where the task naturally starts, by any actions.",
     )
 
@@ -236,7 +260,7 @@ def hidden_table(study: NoisyStudy) -> Table:
         (f"{OBSERVABILITY} % in view", f"LBA after {early}, %", f"LBA after {study.sessions}, %"),
         rows,
         f"Sessions of {TRAJECTORIES} trajectories of {HIDDEN_STEPS} steps, the same paths in both rows. "
-        f"Hidden: reports are exact (LME-I2RL); hidden and noisy: {PLAIN}. Lost: paired over runs.",
+        f"Hidden: reports are exact (LME-I2RL); hidden and noisy: {PLAIN}. Lost: paired over replications.",
     )
 
 
@@ -263,7 +287,8 @@ def belts_table(study: NoisyStudy) -> Table:
         HEADINGS,
         belt_cells(study.belts),
         caption(study.belts)
-        + " Belts of a method are divided among its runs, and its intervals are over runs. Runs that sort "
+        + " Belts of a method are divided among its replications, and its intervals are over "
+        "replications. Replications that sort "
         "have at least half the expert's recall. The dissertation heads its last two columns the other way "
         "round; its percentages fit the order given here.",
     )
@@ -307,9 +332,9 @@ def _text(study: NoisyStudy) -> str:
         else ""
     )
     return f"""An expert acts optimally; every pair of its trajectories is reported, some of them wrongly. \
-The learner knows neither how often nor which. There {"is" if study.runs == 1 else "are"} \
-{counted(study.runs, "independent run")} of {counted(study.sessions, "session")} of {TRAJECTORIES} \
-trajectories of {STEPS} pairs; reports and calibrated scores are the same for every method.
+The learner knows neither how often nor which. There {"is" if study.replications == 1 else "are"} \
+{counted(study.replications, "independent replication")} of {counted(study.sessions, "session")} \
+of {TRAJECTORIES} trajectories of {STEPS} pairs; reports and calibrated scores are the same for every method.
 
 {bare}The sensor is judged by agreement probabilities: how often a predicate of a report is that of the \
 truth. The reliabilities that parametrise the sensor are no frequencies. Controls: the constant one half; \
@@ -323,7 +348,7 @@ number of iterations as RIMEO; those online remember all sessions alike.{natural
 def _doubts(study: NoisyStudy) -> str:
     lines = [
         f"{method}: the sensor is {'' if _identified(study, method) else 'not '}identified "
-        f"(in {doubt.known:.0%} of runs all predicates are)."
+        f"(in {doubt.known:.0%} of replications all predicates are)."
         for method, doubt in study.doubt.items()
     ]
     return " ".join(lines)
@@ -342,21 +367,28 @@ def _lead(study: NoisyStudy) -> Lead:
         f"{number(100 * reach, 2)} % of random weights reach that accuracy, half of them "
         f"{number(100 * float(np.median(study.chance)))} %"
     )
-    runs = "one run shows no spread" if study.runs == 1 else f"a mean of {counted(study.runs, 'run')}"
+    replications = (
+        "one replication shows no spread"
+        if study.replications == 1
+        else f"a mean of {counted(study.replications, 'replication')}"
+    )
     sensor = (
         "and the sensor, which these reports identify"
         if _quotable(study, PLAIN)
         else "but not the sensor, whose errors these reports do not tell from the expert's"
     )
     verdict = "Trust the policy" if reach <= 0.05 else "Do not take the accuracy for evidence"
-    trust = f"{verdict} ({chance}; {runs}), {sensor}."
+    trust = f"{verdict} ({chance}; {replications}), {sensor}."
     rows = [
         (
-            row["feature"], round(row["learned"], 12), row["posterior median"],
-            f"{number(row['95 % interval'][0])} to {number(row['95 % interval'][1])}", float(true),
+            row["feature"],
+            round(row["learned"], 12),
+            row["posterior median"],
+            f"{number(row['95 % interval'][0])} to {number(row['95 % interval'][1])}",
+            float(true),
         )
         for row, true in zip(_reward(study) or [], study.task.weights, strict=False)
-    ]  # fmt: skip
+    ]
     if not rows:
         plain_rows = [
             (name, round(float(weight), 12), float(true))
@@ -378,21 +410,27 @@ def _lead(study: NoisyStudy) -> Lead:
 def write(study: NoisyStudy, folder: Path | str) -> Path:
     """Write the page: ``index.html``, the pictures in both themes, and ``results.json``."""
     divergence = drawn(
-        folder, "divergence", partial(figures.divergence_plot, study),
+        folder,
+        "divergence",
+        partial(figures.divergence_plot, study),
         "How far the learned sensor is from the true one (Figures 7.9 and 7.10).",
         "Divergence of agreement probabilities against sessions, logarithmic, RIMEO and controls",
-    )  # fmt: skip
+    )
     accuracy = drawn(
-        folder, "accuracy", partial(figures.accuracy_plot, study),
+        folder,
+        "accuracy",
+        partial(figures.accuracy_plot, study),
         "Learned behaviour accuracy. The axis does not begin at zero.",
         "Learned behaviour accuracy against sessions for RIMEO, RIFOM and learners that know the sensor",
-    )  # fmt: skip
+    )
     strip = drawn(
-        folder, "strip", partial(figures.strip_plot, study.strip, study.task.mdp),
+        folder,
+        "strip",
+        partial(figures.strip_plot, study.strip, study.task.mdp),
         f"A new trajectory as the first run's learner ({PLAIN}) understands it after its last session. Pairs "
         "that are never likely are left out.",
         "Grid of pairs against steps shaded by posterior probability, with what was seen and what happened",
-    )  # fmt: skip
+    )
     sections = [
         Section("The sensor", _text(study), [sensor_table(study)], [divergence]),
         Section("The expert's errors, or the sensor's?", _doubts(study), [doubt_table(study)]),
@@ -410,22 +448,26 @@ def write(study: NoisyStudy, folder: Path | str) -> Path:
     pictures = [strip]
     if study.posterior is not None:
         sensor = drawn(
-            folder, "sensor", partial(figures.sensor_plot, study.posterior),
+            folder,
+            "sensor",
+            partial(figures.sensor_plot, study.posterior),
             "Joint posterior over reward and reliabilities (NUTS), as agreement probabilities, beside "
             "RIMEO's estimate from the same trajectories.",
             "Posterior intervals of each feature's agreement probability with the truth marked",
-        )  # fmt: skip
+        )
         pictures.insert(0, sensor)
     sections.append(Section("What one learner believes", told, [], pictures))
     if study.belts is not None:
         belts = drawn(
-            folder, "belts",
+            folder,
+            "belts",
             partial(_draw_belts, study.belts),
             "What the learned policies do on simulated belts, beside the dissertation's belt (Figure 7.9).",
             "Precision and recall of the expert and of each method, with intervals",
-        )  # fmt: skip
+        )
         text = (
-            "A policy that errs in a single state on the way may stop sorting altogether: runs sort about as "
+            "A policy that errs in a single state on the way may stop sorting altogether: "
+            "replications sort about as "
             "the expert does, or hardly at all, and a mean over them is like neither."
         )
         sections.append(Section("Sorting", text, [belts_table(study)], [belts]))

@@ -82,23 +82,23 @@ def divergence(
 
 
 class MeanInterval(NamedTuple):
-    """A mean over runs and its 95 % interval."""
+    """A mean over replications and its 95 % interval."""
 
     mean: Float[np.ndarray, "..."]
     low: Float[np.ndarray, "..."]
     high: Float[np.ndarray, "..."]
 
 
-def mean_interval(runs: Float[np.ndarray, "runs ..."]) -> MeanInterval:
+def mean_interval(replications: Float[np.ndarray, "replications ..."]) -> MeanInterval:
     """Mean over the first axis, with the normal distribution's interval; NaN at its ends for one run."""
-    runs = np.asarray(runs, float)
-    mean, n = runs.mean(0), len(runs)
-    half = 1.96 * runs.std(0, ddof=1) / np.sqrt(n) if n > 1 else np.full_like(mean, np.nan)
+    replications = np.asarray(replications, float)
+    mean, n = replications.mean(0), len(replications)
+    half = 1.96 * replications.std(0, ddof=1) / np.sqrt(n) if n > 1 else np.full_like(mean, np.nan)
     return MeanInterval(mean, mean - half, mean + half)
 
 
 class Streams(NamedTuple):
-    """What learners get: ``seen`` and ``truth`` with arrays ``[runs, sessions, trajectories, steps]``.
+    """Learners' data: ``seen`` and ``truth`` with arrays ``[replications, sessions, trajectories, steps]``.
 
     ``mdp`` is the process with the start that was simulated.
     """
@@ -121,7 +121,7 @@ def draw_streams(
     key: Array,
     task: NoisyTask,
     *,
-    runs: int,
+    replications: int,
     sessions: int,
     starts: Starts = "all",
     steps: int = STEPS,
@@ -133,10 +133,17 @@ def draw_streams(
     Raises ``ValueError`` as :func:`demonstrate_noisy` does.
     """
     drawn = demonstrate_noisy(
-        key, task, noise, sessions=runs * sessions, trajectories=TRAJECTORIES, steps=steps, starts=starts,
-        scores="calibrated", view=view,
-    )  # fmt: skip
-    shape = (runs, sessions, TRAJECTORIES, steps)
+        key,
+        task,
+        noise,
+        sessions=replications * sessions,
+        trajectories=TRAJECTORIES,
+        steps=steps,
+        starts=starts,
+        scores="calibrated",
+        view=view,
+    )
+    shape = (replications, sessions, TRAJECTORIES, steps)
     seen, truth = (
         Demonstration(*(np.asarray(x).reshape(shape) for x in d)) for d in (drawn.seen, drawn.truth)
     )
@@ -151,23 +158,23 @@ class MethodResult(NamedTuple):
     name : str
     sessions : int ``[T]``
         After which it was measured.
-    weights : float ``[runs, T, K]``
-    agreement : float ``[runs, T, J]`` or None
+    weights : float ``[replications, T, K]``
+    agreement : float ``[replications, T, J]`` or None
         Learned agreement probabilities of what the learner knows, the task's predicates first.
-    divergence : float ``[runs, T]`` or None
+    divergence : float ``[replications, T]`` or None
         Of the predicates' from the true ones, mean over predicates, in nats.
-    accuracy : float ``[runs, T, 3]``
+    accuracy : float ``[replications, T, 3]``
         LBA over :data:`STATES`.
     state
-        The learner's final states (leading axis: runs), None for those that have none.
+        The learner's final states (leading axis: replications), None for those that have none.
     """
 
     name: str
     sessions: Int[np.ndarray, " T"]
-    weights: Float[np.ndarray, "runs T K"]
-    agreement: Float[np.ndarray, "runs T J"] | None
-    divergence: Float[np.ndarray, "runs T"] | None
-    accuracy: Float[np.ndarray, "runs T 3"]
+    weights: Float[np.ndarray, "replications T K"]
+    agreement: Float[np.ndarray, "replications T J"] | None
+    divergence: Float[np.ndarray, "replications T"] | None
+    accuracy: Float[np.ndarray, "replications T 3"]
     state: Any = None
 
 
@@ -176,18 +183,18 @@ class SensorDoubt(NamedTuple):
 
     Fields
     ------
-    erratic, decided : float ``[runs, J]``
+    erratic, decided : float ``[replications, J]``
         Agreement of the task's predicates, by what is assumed of the expert.
-    identified : bool ``[runs, J]``
+    identified : bool ``[replications, J]``
     """
 
-    erratic: Float[np.ndarray, "runs J"]
-    decided: Float[np.ndarray, "runs J"]
-    identified: Bool[np.ndarray, "runs J"]
+    erratic: Float[np.ndarray, "replications J"]
+    decided: Float[np.ndarray, "replications J"]
+    identified: Bool[np.ndarray, "replications J"]
 
     @property
     def known(self) -> float:
-        """Share of runs in which all predicates are identified."""
+        """Share of replications in which all predicates are identified."""
         return float(self.identified.all(1).mean())
 
 
@@ -197,7 +204,7 @@ class NoisyStudy(NamedTuple):
     Fields
     ------
     task : NoisyTask
-    starts, runs, sessions, seed
+    starts, replications, sessions, seed
     streams : Streams
     true_agreement : float ``[J]``
         Of the task's predicates, among the expert's pairs.
@@ -222,7 +229,7 @@ class NoisyStudy(NamedTuple):
 
     task: NoisyTask
     starts: Starts
-    runs: int
+    replications: int
     sessions: int
     seed: int
     streams: Streams
@@ -309,10 +316,10 @@ class _Judge(NamedTuple):
 
     def batch(self, name: str, key: Array, streams: Streams) -> MethodResult:
         """A learner that is given all of a stream at once, on a few streams."""
-        runs, sessions = streams.seen.kind.shape[:2]
+        replications, sessions = streams.seen.kind.shape[:2]
         robust = robust_irl(streams.mdp, self.task.noise, slack=0.0, ridge=DEFAULT_RIDGE)
         weights = []
-        for run in range(min(runs, FEW)):
+        for run in range(min(replications, FEW)):
             reports, own = streams.whole(run), jax.random.fold_in(key, run)
             if name == ROBUST:
                 weights.append(robust.fit(own, reports).weights)
@@ -341,9 +348,12 @@ def _judged_states(task: NoisyTask) -> Bool[np.ndarray, "3 S"]:
 
 def _learned(key: Array, learner: Learner, streams: Streams, entry: _Entry) -> tuple:
     """Weights and agreement after every session, and the final states."""
-    runs = len(streams.seen.kind)
+    replications = len(streams.seen.kind)
     if learner.session is None:
-        kept = [_one_by_one(jax.random.fold_in(key, r), learner, streams, r) for r in range(min(runs, FEW))]
+        kept = [
+            _one_by_one(jax.random.fold_in(key, r), learner, streams, r)
+            for r in range(min(replications, FEW))
+        ]
         weights, agreement = (np.array(x) for x in zip(*kept, strict=True))
         return weights, agreement, None
     fed = {
@@ -398,7 +408,7 @@ def _doubted(task: NoisyTask, streams: Streams, result: MethodResult, scores: st
 def noisy_study(
     name: str,
     *,
-    runs: int = 50,
+    replications: int = 50,
     sessions: int = 20,
     starts: Starts = "all",
     seed: int = 0,
@@ -412,7 +422,7 @@ def noisy_study(
     Parameters
     ----------
     name : {"sorting", "patrol"}
-    runs, sessions : int
+    replications, sessions : int
         Independent streams, and sessions of each: two trajectories of three pairs. Learners in batch, and
         those outside JAX, get the first :data:`FEW` streams.
     starts : {"all", "natural"}
@@ -432,7 +442,7 @@ def noisy_study(
     """
     if name not in TASKS:
         raise ValueError(f"tasks are {', '.join(TASKS)}; got {name!r}")
-    for what, number in (("runs", runs), ("sessions", sessions), ("belts", belts)):
+    for what, number in (("replications", replications), ("sessions", sessions), ("belts", belts)):
         if number < 1:
             raise ValueError(f"{what} must be at least 1, got {number}")
     if draws < 0:
@@ -443,7 +453,7 @@ def noisy_study(
     task = TASKS[name]()
     chosen = [m for m in METHODS if methods is None or m in methods or m == PLAIN]
     draw, learn, hide, show = jax.random.split(jax.random.key(seed), 4)
-    streams = draw_streams(draw, task, runs=runs, sessions=sessions, starts=starts)
+    streams = draw_streams(draw, task, replications=replications, sessions=sessions, starts=starts)
     pairs = task.pair_distribution(starts, STEPS)
     judge = _Judge(task, agreement_probabilities(task.noise, task.predicates, pairs), _judged_states(task))
     results = {}
@@ -458,15 +468,28 @@ def noisy_study(
     seconds = _seconds([method for method in TIMED if method in results], task, streams)
     doubt = {m: _doubted(task, streams, results[m], scores) for m, scores in DOUBTED.items() if m in results}
     advance("out of view", (len(chosen) + 1) / (len(chosen) + 3))
-    hidden = _hidden(hide, judge, runs, sessions, starts) if name == "patrol" else None
+    hidden = _hidden(hide, judge, replications, sessions, starts) if name == "patrol" else None
     advance("examples", (len(chosen) + 2) / (len(chosen) + 3))
     posterior, happened, sorted_ = _examples(show, judge, streams, results, starts, pairs, belts, draws)
     advance("done", 1.0)
     return NoisyStudy(
-        task, starts, runs, sessions, seed, streams, judge.true_agreement, judge.states, results, seconds,
-        doubt, hidden, posterior, happened, sorted_,
+        task,
+        starts,
+        replications,
+        sessions,
+        seed,
+        streams,
+        judge.true_agreement,
+        judge.states,
+        results,
+        seconds,
+        doubt,
+        hidden,
+        posterior,
+        happened,
+        sorted_,
         chance_accuracy(jax.random.fold_in(show, 200), task.mdp, jnp.asarray(task.weights)),
-    )  # fmt: skip
+    )
 
 
 def _seconds(methods: Sequence[str], task: NoisyTask, streams: Streams) -> dict[str, float]:
@@ -486,7 +509,9 @@ def _seconds(methods: Sequence[str], task: NoisyTask, streams: Streams) -> dict[
     return {method: float(np.median(seconds)) for method, seconds in zip(methods, taken, strict=True)}
 
 
-def _hidden(key: Array, judge: _Judge, runs: int, sessions: int, starts: Starts) -> dict[str, MethodResult]:
+def _hidden(
+    key: Array, judge: _Judge, replications: int, sessions: int, starts: Starts
+) -> dict[str, MethodResult]:
     """Most states out of view: without noise, and with noise that is learned; the same paths are walked."""
     view = instance(2).visibility(OBSERVABILITY)
     draw, learn = jax.random.split(key)
@@ -496,9 +521,15 @@ def _hidden(key: Array, judge: _Judge, runs: int, sessions: int, starts: Starts)
     results = {}
     for method, noise, entry in ((HIDDEN, noisy_patrol(0.0).noise, clear), (BOTH, judge.task.noise, noisy)):
         streams = draw_streams(
-            draw, judge.task, runs=runs, sessions=sessions, starts=starts, steps=HIDDEN_STEPS, noise=noise,
+            draw,
+            judge.task,
+            replications=replications,
+            sessions=sessions,
+            starts=starts,
+            steps=HIDDEN_STEPS,
+            noise=noise,
             view=view,
-        )  # fmt: skip
+        )
         learner = entry.learner(streams.mdp, judge.task)
         results[method] = judge.online(method, learn, learner, streams, entry)
     return results

@@ -44,8 +44,12 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 ONLINE, FORGETFUL, BATCH, RANDOM, TRUE = (
-    "LME-I2RL", "LME-I2RL with random weights", "batch LME", "random weights", "true policy",
-)  # fmt: skip
+    "LME-I2RL",
+    "LME-I2RL with random weights",
+    "batch LME",
+    "random weights",
+    "true policy",
+)
 # Names on the command line.
 METHODS = {"lme-i2rl": ONLINE, "batch": BATCH, "random": RANDOM}
 STEPS_PER_SESSION = 5
@@ -58,24 +62,24 @@ Advance = Callable[[str, float | None], None]
 
 
 class MethodResult(NamedTuple):
-    """What a method reached; the first axis runs over independent runs and the patrollers of each.
+    """What a method reached; the first axis runs over independent replications and the patrollers of each.
 
     Fields
     ------
     name : str
     points : int ``[T]``
         Sessions at which the rest was measured.
-    weights : float ``[runs, patrollers, T, K]``
-    accuracy, choice_accuracy : float ``[runs * patrollers, T]``
+    weights : float ``[replications, patrollers, T, K]``
+    accuracy, choice_accuracy : float ``[replications * patrollers, T]``
         LBA over all states and over states with a choice.
-    error : float ``[runs * patrollers, T]``
+    error : float ``[replications * patrollers, T]``
         ILE relative to the value of the optimal policy.
-    log_likelihood : float ``[runs * patrollers, T]``
+    log_likelihood : float ``[replications * patrollers, T]``
         Exact, of fresh demonstrations that nobody learned from; nats per trajectory.
-    seconds : float ``[runs, T]``
+    seconds : float ``[replications, T]``
         Learning time up to there, all patrollers together.
     breach : BreachOutcome or None
-        All runs' trials together.
+        All replications' trials together.
     """
 
     name: str
@@ -96,7 +100,7 @@ class Study(NamedTuple):
     observability: int
     sessions: int
     trials: int
-    runs: int
+    replications: int
     seed: int
     methods: tuple[MethodResult, ...]
     batch_rerun_seconds: np.ndarray | None
@@ -146,15 +150,15 @@ def patrol_study(
     *,
     sessions: int = 60,
     trials: int = 200,
-    runs: int = 3,
+    replications: int = 3,
     seed: int = 0,
     methods: Sequence[str] | None = None,
     advance: Advance = lambda description, fraction: None,
 ) -> Study:
     """Learn, evaluate and (instances 2 and 3) breach.
 
-    ``runs`` independent demonstrations are learned from, one learner per patroller; each learned set of
-    policies then tries ``trials`` breaches, with the time it took to learn on the clock. ``methods`` names
+    ``replications`` independent demonstrations are learned from, one learner per patroller; each learned set
+    of policies then tries ``trials`` breaches, with the time it took to learn on the clock. ``methods`` names
     some of ``lme-i2rl``, ``batch`` and ``random`` (all by default). Raises ``ValueError`` for an instance,
     observability or method that does not exist.
     """
@@ -165,7 +169,7 @@ def patrol_study(
     if unknown:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {unknown[0]!r}")
     wanted = {METHODS[m] for m in methods} if methods else {ONLINE, FORGETFUL, BATCH, RANDOM}
-    keys = jax.random.split(jax.random.key(seed), runs)
+    keys = jax.random.split(jax.random.key(seed), replications)
     data = [demonstrate(k, patrol, observability, sessions, STEPS_PER_SESSION) for k in keys]
     learners = {
         ONLINE: partial(_online, lme_i2rl(patrol.mdp, view)),
@@ -201,9 +205,19 @@ def patrol_study(
     )
     advance("done", 1.0)
     return Study(
-        patrol, observability, sessions, trials, runs, seed, tuple(results), rerun, stretch, determined,
-        chance, truth,
-    )  # fmt: skip
+        patrol,
+        observability,
+        sessions,
+        trials,
+        replications,
+        seed,
+        tuple(results),
+        rerun,
+        stretch,
+        determined,
+        chance,
+        truth,
+    )
 
 
 class _Learned(NamedTuple):
@@ -217,12 +231,12 @@ class _Learned(NamedTuple):
 def _online(learner: Learner, key: jax.Array, demonstrations: Sequence[Demonstration]) -> _Learned:
     # One session first, unrecorded, so that compilation is not counted as learning.
     learner.update(learner.init(key), demonstrations[0].select([0]))
-    runs = [
+    replications = [
         run_sessions(learner, d.sessions(), key=jax.random.fold_in(key, p)).infos
         for p, d in enumerate(demonstrations)
     ]
-    weights = np.array([[r.weights for r in reports] for reports in runs])
-    seconds = np.cumsum(np.sum([[r.seconds for r in reports] for reports in runs], axis=0))
+    weights = np.array([[r.weights for r in reports] for reports in replications])
+    seconds = np.cumsum(np.sum([[r.seconds for r in reports] for reports in replications], axis=0))
     return _Learned(np.arange(1, weights.shape[1] + 1), weights, seconds)
 
 
@@ -256,8 +270,9 @@ def _likelihoods(
     view = patrol.visibility(observability)
     likelihood = lax.map(
         lambda w: jnp.mean(demonstration_log_likelihoods(patrol.mdp, view, w, fresh)),
-        jnp.asarray(weights), batch_size=16,
-    )  # fmt: skip
+        jnp.asarray(weights),
+        batch_size=16,
+    )
     return np.asarray(likelihood)
 
 
@@ -287,31 +302,42 @@ def _evaluated(
     trials: int,
 ) -> MethodResult:
     weights = np.stack([one.weights for one in learned])
-    runs, patrollers, n, k = weights.shape
+    replications, patrollers, n, k = weights.shape
     scores = jax.vmap(partial(evaluate, patrol.mdp, jnp.asarray(patrol.weights)))(
         jnp.asarray(weights).reshape(-1, k)
     )
-    shape = (runs * patrollers, n)
+    shape = (replications * patrollers, n)
     likelihood = _likelihoods(patrol, observability, weights.reshape(-1, k))
     breach = None
     if patrol.breach is not None:
         outcomes = [
             breach_trials(
-                jax.random.fold_in(key, 99), patrol, greedy_policies(patrol, weights[i, :, -1]),
-                observability=observability, observed_steps=sessions * STEPS_PER_SESSION, trials=trials,
+                jax.random.fold_in(key, 99),
+                patrol,
+                greedy_policies(patrol, weights[i, :, -1]),
+                observability=observability,
+                observed_steps=sessions * STEPS_PER_SESSION,
+                trials=trials,
                 learning_seconds=float(learned[i].seconds[-1]),
             )
             for i, key in enumerate(keys)
-        ]  # fmt: skip
+        ]
         breach = BreachOutcome(
-            np.concatenate([o.ended for o in outcomes]), np.concatenate([o.waited for o in outcomes]),
+            np.concatenate([o.ended for o in outcomes]),
+            np.concatenate([o.waited for o in outcomes]),
             float(np.mean([o.threshold for o in outcomes])),
-        )  # fmt: skip
+        )
     return MethodResult(
-        name, learned[0].points, weights, np.asarray(scores.accuracy.overall).reshape(shape),
-        np.asarray(scores.accuracy.choice).reshape(shape), np.asarray(scores.error.relative).reshape(shape),
-        likelihood.reshape(shape), np.stack([one.seconds for one in learned]), breach,
-    )  # fmt: skip
+        name,
+        learned[0].points,
+        weights,
+        np.asarray(scores.accuracy.overall).reshape(shape),
+        np.asarray(scores.accuracy.choice).reshape(shape),
+        np.asarray(scores.error.relative).reshape(shape),
+        likelihood.reshape(shape),
+        np.stack([one.seconds for one in learned]),
+        breach,
+    )
 
 
 def _stretch(key: jax.Array, patrol: Patrol, observability: int, weights: np.ndarray) -> Stretch:
@@ -368,19 +394,21 @@ def summary(study: Study) -> dict[str, Any]:
         ],
         "by method, run and patroller": {m.name: m.weights[:, :, -1] for m in study.methods},
     }
-    told: dict[str, Any] = plain({
-        "provenance": study_provenance(study.seed),
-        "patrol": study.patrol.name,
-        "observability": study.observability,
-        "sessions": study.sessions,
-        "trials": study.trials,
-        "runs": study.runs,
-        "seed": study.seed,
-        "methods": _rows(study),
-        "reward": reward,
-        "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
-        "true weights": study.truth._asdict(),
-    })  # fmt: skip
+    told: dict[str, Any] = plain(
+        {
+            "provenance": study_provenance(study.seed),
+            "patrol": study.patrol.name,
+            "observability": study.observability,
+            "sessions": study.sessions,
+            "trials": study.trials,
+            "replications": study.replications,
+            "seed": study.seed,
+            "methods": _rows(study),
+            "reward": reward,
+            "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
+            "true weights": study.truth._asdict(),
+        }
+    )
     return told
 
 
@@ -407,16 +435,24 @@ def _results_table(study: Study) -> Table:
         success = _percent(row["success"])
         if interval is not None:
             success += f" ({100 * interval[0]:.0f}-{100 * interval[1]:.0f})"
-        cells.append((
-            row["method"], _percent(row["LBA"]), _percent(row["LBA choice states"]), f"{row['ILE']:.4f}",
-            f"{row['log-likelihood']:.3f}", success, _percent(row["time-outs"]),
-            number(row["seconds per session"]),
-        ))  # fmt: skip
+        cells.append(
+            (
+                row["method"],
+                _percent(row["LBA"]),
+                _percent(row["LBA choice states"]),
+                f"{row['ILE']:.4f}",
+                f"{row['log-likelihood']:.3f}",
+                success,
+                _percent(row["time-outs"]),
+                number(row["seconds per session"]),
+            )
+        )
     return Table(_HEADINGS, cells, _CAPTION)
 
 
 _CAPTION = (
-    "Medians over runs and patrollers. ILE is relative to the optimal value. Nats: log-likelihood of fresh "
+    "Medians over replications and patrollers. ILE is relative to the optimal value. Nats: log-likelihood of "
+    "fresh "
     "demonstrations. Seconds: all patrollers together; for batch, those of one run over everything, spent "
     "again at each session."
 )
@@ -430,7 +466,7 @@ def print_tables(study: Study, console: Console) -> None:
 def _settings(study: Study) -> str:
     told = (
         f"{study.patrol.name}, {study.observability} % in view, {counted(study.sessions, 'session')} of "
-        f"{STEPS_PER_SESSION} steps, {counted(study.runs, 'run')}"
+        f"{STEPS_PER_SESSION} steps, {counted(study.replications, 'replication')}"
     )
     return told if study.patrol.breach is None else f"{told} of {counted(study.trials, 'breach')}"
 
@@ -517,35 +553,50 @@ def write(study: Study, folder: Path | str) -> Path:
     policy = greedy_policies(study.patrol, first.weights[0, :1, -1])[0]
     pictures = [
         drawn(
-            folder, "policy", lambda theme: policy_map(
-                study.patrol, np.exp(np.asarray(policy)), study.observability, theme=theme,
+            folder,
+            "policy",
+            lambda theme: policy_map(
+                study.patrol,
+                np.exp(np.asarray(policy)),
+                study.observability,
+                theme=theme,
                 title=f"Policy of {first.name}",
             ),
             "What the first patroller is believed to do in every state; tinted cells are in view.",
             "Map of the patrol with the learned policy as arrows",
         ),
         drawn(
-            folder, "hidden-path", lambda theme: hidden_path(
+            folder,
+            "hidden-path",
+            lambda theme: hidden_path(
                 study.patrol, study.stretch.posterior, study.stretch.seen, study.stretch.path, theme=theme
             ),
             "A stretch of patrol nobody learned from: belief about the hidden steps, given the seen ones.",
             "Probability of each cell over time, with the true path",
         ),
-    ]  # fmt: skip
+    ]
     learning = [m for m in study.methods if m.name not in (RANDOM, TRUE)]
     if learning:
         curves = [LearningCurve(m.name, m.points, m.accuracy, m.log_likelihood) for m in learning]
-        pictures.append(drawn(
-            folder, "learning", lambda theme: learning_curves(curves, theme=theme),
-            "Accuracy of the learned behaviour, and likelihood of fresh demonstrations, as sessions go by.",
-            "Accuracy and log-likelihood against sessions",
-        ))  # fmt: skip
-        pictures.append(drawn(
-            folder, "time", partial(_draw_time, study, learning),
-            "Learning time of all patrollers together, without compilation. Running batch after every "
-            f"session is summed by interpolation between the {BATCH_POINTS} points at which it was timed.",
-            "Learning time against trajectories",
-        ))  # fmt: skip
+        pictures.append(
+            drawn(
+                folder,
+                "learning",
+                lambda theme: learning_curves(curves, theme=theme),
+                "Accuracy of the learned behaviour and likelihood of fresh demonstrations, by session.",
+                "Accuracy and log-likelihood against sessions",
+            )
+        )
+        pictures.append(
+            drawn(
+                folder,
+                "time",
+                partial(_draw_time, study, learning),
+                "Learning time of all patrollers together, without compilation. Running batch after every "
+                f"session is summed by interpolation between its {BATCH_POINTS} timed points.",
+                "Learning time against trajectories",
+            )
+        )
     rates = [
         SuccessRate(m.name, int((ended == REACHED).sum()), int((ended == TIMED_OUT).sum()), len(ended))
         for m in study.methods
@@ -553,11 +604,15 @@ def write(study: Study, folder: Path | str) -> Path:
         for ended in [m.breach.ended]
     ]
     if rates:
-        pictures.append(drawn(
-            folder, "success", lambda theme: success_rates(rates, theme=theme),
-            "Share of simulated breaches that reached a goal unseen, and that timed out.",
-            "Success and time-out rates by method",
-        ))  # fmt: skip
+        pictures.append(
+            drawn(
+                folder,
+                "success",
+                lambda theme: success_rates(rates, theme=theme),
+                "Share of simulated breaches that reached a goal unseen, and that timed out.",
+                "Success and time-out rates by method",
+            )
+        )
     sections = [Section("Results", _text(study), [_results_table(study)], pictures)]
     if study.determined:
         sections.append(identifiability_section(_by_patroller(study)))

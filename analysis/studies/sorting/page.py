@@ -39,37 +39,39 @@ if TYPE_CHECKING:
 
 def summary(study: SortingStudy) -> dict[str, Any]:
     """Settings and all measures as plain data."""
-    told: dict[str, Any] = plain({
-        "provenance": study_provenance(study.seed),
-        "process": study.sorting.name,
-        "tasks": study.tasks,
-        "behaviours": list(study.sorting.behaviours[: study.tasks]),
-        "ways started from": study.n_components,
-        "steps": study.steps,
-        "runs": study.runs,
-        "seed": study.seed,
-        "EVD of the best single behaviour": study.one_component,
-        "online over batch, seconds": study.online_share,
-        "methods": [
-            {
-                "method": result.name,
-                "trajectories": result.trajectories.tolist(),
-                "EVD": result.measures.value_difference.tolist(),
-                "components": result.measures.n_components.tolist(),
-                "assignment accuracy": result.measures.accuracy.tolist(),
-                "adjusted Rand index": result.measures.rand.tolist(),
-                "seconds": result.measures.seconds.tolist(),
-                "weights of the first run": result.found.weights.tolist(),
-                "proportions of the first run": result.found.proportions.tolist(),
-            }
-            for result in study.results
-        ],
-        "components of the first run": [
-            {"component": component, "weights": found.summary()}
-            for component, found in _estimates(study).items()
-        ],
-        "table 7.2": sorting_table_summary(study.table),
-    })  # fmt: skip
+    told: dict[str, Any] = plain(
+        {
+            "provenance": study_provenance(study.seed),
+            "process": study.sorting.name,
+            "tasks": study.tasks,
+            "behaviours": list(study.sorting.behaviours[: study.tasks]),
+            "ways started from": study.n_components,
+            "steps": study.steps,
+            "replications": study.replications,
+            "seed": study.seed,
+            "EVD of the best single behaviour": study.one_component,
+            "online over batch, seconds": study.online_share,
+            "methods": [
+                {
+                    "method": result.name,
+                    "trajectories": result.trajectories.tolist(),
+                    "EVD": result.measures.value_difference.tolist(),
+                    "components": result.measures.n_components.tolist(),
+                    "assignment accuracy": result.measures.accuracy.tolist(),
+                    "adjusted Rand index": result.measures.rand.tolist(),
+                    "seconds": result.measures.seconds.tolist(),
+                    "weights of the first run": result.found.weights.tolist(),
+                    "proportions of the first run": result.found.proportions.tolist(),
+                }
+                for result in study.results
+            ],
+            "components of the first run": [
+                {"component": component, "weights": found.summary()}
+                for component, found in _estimates(study).items()
+            ],
+            "table 7.2": sorting_table_summary(study.table),
+        }
+    )
     return told
 
 
@@ -110,16 +112,19 @@ def _results_table(study: SortingStudy) -> Table:
         m = result.measures
         for t, n in enumerate(result.trajectories):
             evd = m.value_difference[:, t]
-            rows.append((
-                result.name if t == 0 else "", f"{n}",
-                f"{number(evd.mean())} ({number(evd.min())} to {number(evd.max())})",
-                number(evd.mean() / study.steps, 2),
-                f"{np.median(m.n_components[:, t]):g} "
-                f"({(m.n_components[:, t] == study.tasks).sum()} of {study.runs})",
-                f"{100 * m.accuracy[:, t].mean():.1f}",
-                f"{m.rand[:, t].mean():.3f}",
-                number(np.median(m.seconds[:, t])),
-            ))  # fmt: skip
+            rows.append(
+                (
+                    result.name if t == 0 else "",
+                    f"{n}",
+                    f"{number(evd.mean())} ({number(evd.min())} to {number(evd.max())})",
+                    number(evd.mean() / study.steps, 2),
+                    f"{np.median(m.n_components[:, t]):g} "
+                    f"({(m.n_components[:, t] == study.tasks).sum()} of {study.replications})",
+                    f"{100 * m.accuracy[:, t].mean():.1f}",
+                    f"{m.rand[:, t].mean():.3f}",
+                    number(np.median(m.seconds[:, t])),
+                )
+            )
     share = study.online_share
     online = (
         ""
@@ -127,7 +132,16 @@ def _results_table(study: SortingStudy) -> Table:
         else f" All sessions online took {100 * share:.0f} % of the time of batch at the end of each."
     )
     return Table(
-        ("method", "N", "EVD (all runs)", "a step", "ways (right in)", "accuracy, %", "Rand", "seconds"),
+        (
+            "method",
+            "N",
+            "EVD (all replications)",
+            "a step",
+            "ways (right in)",
+            "accuracy, %",
+            "Rand",
+            "seconds",
+        ),
         rows,
         f"N: trajectories. EVD: mean of {_runs(study)}, in discounted reward a trajectory; the best "
         f"single behaviour for all has {number(study.one_component)}. Ways: median number found. "
@@ -142,7 +156,11 @@ def _title(study: SortingStudy) -> str:
 
 
 def _runs(study: SortingStudy) -> str:
-    return "one run" if study.runs == 1 else counted(study.runs, "independent run")
+    return (
+        "one replication"
+        if study.replications == 1
+        else counted(study.replications, "independent replication")
+    )
 
 
 def _text(study: SortingStudy) -> str:
@@ -173,7 +191,7 @@ def _scope(study: SortingStudy) -> str:
     if tuple(study.counts) == FEW[study.tasks]:
         told.append(
             "These are few numbers of trajectories, since every method is compiled for each; the "
-            "dissertation's design is `--trajectories all --runs 10`."
+            "dissertation's design is `--trajectories all --replications 10`."
         )
     if study.counts[0] < study.n_components:
         told.append(
@@ -208,14 +226,18 @@ def _lead(study: SortingStudy) -> Lead:
         f"trajectories in the right one, and loses {number(lost)} of the value, where one way for all "
         f"loses {number(study.one_component)}."
     )
-    known = right == study.runs and lost < 0.1 * study.one_component
-    spread = "one run shows no spread" if study.runs == 1 else f"so it was in {right} of {study.runs} runs"
+    known = right == study.replications and lost < 0.1 * study.one_component
+    spread = (
+        "one replication shows no spread"
+        if study.replications == 1
+        else f"so it was in {right} of {study.replications} replications"
+    )
     trust = (
         f"Trust the ways and what they do ({spread}); the weights of experts who never err have no scale of "
         "their own, so trust their signs where an interval leaves zero out."
         if known
         else "Do not trust it as it is: the true number was found in "
-        f"{right} of {counted(study.runs, 'run')}, and more trajectories may be needed."
+        f"{right} of {counted(study.replications, 'replication')}, and more trajectories may be needed."
     )
     tables = [
         estimates.table(
@@ -238,27 +260,45 @@ def write(study: SortingStudy, folder: Path | str) -> Path:
     pictures = [
         drawn(folder, name, draw, told, description)
         for name, draw, told, description in (
-            ("clusters", partial(figures.clusters_plot, study),
-             "All trajectories of the first run by what they count: which way each was done, and which it "
-             "was found to be.",
-             "Scatter plots of trajectories' feature counts on two principal components, one a method"),
-            ("components", partial(figures.components_diagram, study),
-             "What a sorter does who follows each way that was found.",
-             "State diagrams of each way found: where the onion is, what is thought of it, and what is done"),
-            ("evd", partial(figures.evd_plot, study),
-             "Value lost by acting as was learned (Figure 7.8).",
-             "Expected value difference against trajectories for each method, with the spread over runs"),
-            ("number", partial(figures.components_plot, study),
-             "How many ways were found.",
-             "Number of ways found against trajectories, one panel a method, the true number marked"),
-            ("time", partial(figures.time_plot, study),
-             "Seconds of learning, compilation left out.",
-             "Learning time against trajectories on logarithmic scales"),
-            ("table", lambda theme: sorting_table_plot(study.table, theme=theme, title="Table 7.2"),
-             "Table 7.2: what the learned ways do on simulated belts, beside the dissertation's belt.",
-             "Precision and recall of every method for both behaviours"),
+            (
+                "clusters",
+                partial(figures.clusters_plot, study),
+                "All trajectories of the first run by what they count: which way each was done, and which it "
+                "was found to be.",
+                "Scatter plots of trajectories' feature counts on two principal components, one a method",
+            ),
+            (
+                "components",
+                partial(figures.components_diagram, study),
+                "What a sorter does who follows each way that was found.",
+                "State diagram of each component: the onion's place, the prediction, and the action",
+            ),
+            (
+                "evd",
+                partial(figures.evd_plot, study),
+                "Value lost by acting as was learned (Figure 7.8).",
+                "Expected value difference of each method against trajectories, and its spread",
+            ),
+            (
+                "number",
+                partial(figures.components_plot, study),
+                "How many ways were found.",
+                "Number of ways found against trajectories, one panel a method, the true number marked",
+            ),
+            (
+                "time",
+                partial(figures.time_plot, study),
+                "Seconds of learning, compilation left out.",
+                "Learning time against trajectories on logarithmic scales",
+            ),
+            (
+                "table",
+                lambda theme: sorting_table_plot(study.table, theme=theme, title="Table 7.2"),
+                "Table 7.2: what the learned ways do on simulated belts, beside the dissertation's belt.",
+                "Precision and recall of every method for both behaviours",
+            ),
         )
-    ]  # fmt: skip
+    ]
     learned = Section("Found in the jumble", _text(study), [_results_table(study)], pictures[:-1])
     sorted_ = Section(
         "Sorting as was learned",

@@ -56,7 +56,7 @@ METHODS = {
 
 
 class Measures(NamedTuple):
-    """What is measured of a method, each ``[runs, T]``.
+    """What is measured of a method, each ``[replications, T]``.
 
     Fields
     ------
@@ -72,11 +72,11 @@ class Measures(NamedTuple):
         Of learning, compilation left out; online: of all sessions so far.
     """
 
-    value_difference: Float[np.ndarray, "runs T"]
-    n_components: Int[np.ndarray, "runs T"]
-    accuracy: Float[np.ndarray, "runs T"]
-    rand: Float[np.ndarray, "runs T"]
-    seconds: Float[np.ndarray, "runs T"]
+    value_difference: Float[np.ndarray, "replications T"]
+    n_components: Int[np.ndarray, "replications T"]
+    accuracy: Float[np.ndarray, "replications T"]
+    rand: Float[np.ndarray, "replications T"]
+    seconds: Float[np.ndarray, "replications T"]
 
 
 class MethodResult(NamedTuple):
@@ -104,7 +104,7 @@ class SortingStudy(NamedTuple):
     Fields
     ------
     sorting : Sorting
-    tasks, n_components, steps, runs, seed : int
+    tasks, n_components, steps, replications, seed : int
         Behaviours demonstrated; ways that learners begin with; steps of a trajectory.
     counts : int ``[T]``
         Numbers of trajectories that batch methods learn from.
@@ -123,7 +123,7 @@ class SortingStudy(NamedTuple):
     tasks: int
     n_components: int
     steps: int
-    runs: int
+    replications: int
     seed: int
     counts: Int[np.ndarray, " T"]
     sessions: Int[np.ndarray, " J"]
@@ -135,7 +135,7 @@ class SortingStudy(NamedTuple):
 
     @property
     def online_share(self) -> float | None:
-        """Seconds of all online sessions over those of batch run again at the end of each: median of runs.
+        """Seconds of all online sessions over those of batch after each session, median over replications.
 
         None if the two were not both measured at the same numbers of trajectories.
         """
@@ -158,7 +158,7 @@ def sorting_study(
     tasks: int = 2,
     counts: Sequence[int] | None = None,
     *,
-    runs: int = 3,
+    replications: int = 3,
     seed: int = 0,
     methods: Sequence[str] | None = None,
     sessions: int | None = None,
@@ -176,7 +176,7 @@ def sorting_study(
     counts : sequence of int, optional
         Numbers of trajectories, about as many of each behaviour. By default :data:`FEW` of them;
         :data:`GRID` has the dissertation's.
-    runs, seed : int
+    replications, seed : int
         Independent repetitions. A smaller number of trajectories is the beginning of a larger one's.
     methods : sequence of str, optional
         Keys of :data:`METHODS`, all by default. EM-MLIRL is given the true number of ways, as in the
@@ -196,14 +196,16 @@ def sorting_study(
     ValueError
         For numbers that make no study, saying which.
     """
-    _check(tasks, counts, runs, methods, sessions, n_components, steps, belts)
+    _check(tasks, counts, replications, methods, sessions, n_components, steps, belts)
     sizes = np.array(sorted(set(FEW[tasks] if counts is None else counts)))
     most = int(sizes[-1])
     ends = sizes if sessions is None else np.linspace(0, most, sessions + 1).round().astype(int)[1:]
     sorting = sorting_with_claiming()
     walk, belt = jax.random.split(jax.random.key(seed))
     borders = np.union1d(sizes, ends)
-    streams = [_stream(jax.random.fold_in(walk, run), sorting, tasks, borders, steps) for run in range(runs)]
+    streams = [
+        _stream(jax.random.fold_in(walk, run), sorting, tasks, borders, steps) for run in range(replications)
+    ]
     chosen = [name for name in METHODS if methods is None or name in methods]
     results = []
     for i, method in enumerate(chosen):
@@ -227,9 +229,20 @@ def sorting_study(
     table = table_7_2(belt, sorting, learned, belts=belts)
     advance("done", 1.0)
     return SortingStudy(
-        sorting, tasks, n_components, steps, runs, seed, sizes, ends, tuple(results),
-        _one_component(sorting, tasks, first), first.demonstration, first.labels, table,
-    )  # fmt: skip
+        sorting,
+        tasks,
+        n_components,
+        steps,
+        replications,
+        seed,
+        sizes,
+        ends,
+        tuple(results),
+        _one_component(sorting, tasks, first),
+        first.demonstration,
+        first.labels,
+        table,
+    )
 
 
 def counts_of(tasks: int, text: str | None) -> tuple[int, ...] | None:
@@ -252,7 +265,7 @@ def counts_of(tasks: int, text: str | None) -> tuple[int, ...] | None:
 def _check(
     tasks: int,
     counts: Sequence[int] | None,
-    runs: int,
+    replications: int,
     methods: Sequence[str] | None,
     sessions: int | None,
     n_components: int,
@@ -263,7 +276,12 @@ def _check(
         raise ValueError(
             f"tasks must be 2 (pick-inspect-place and roll-pick-place) or 3 (and keep claiming), got {tasks}"
         )
-    for name, number in (("n_components", n_components), ("runs", runs), ("steps", steps), ("belts", belts)):
+    for name, number in (
+        ("n_components", n_components),
+        ("replications", replications),
+        ("steps", steps),
+        ("belts", belts),
+    ):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
     counts = FEW[tasks] if counts is None else counts
@@ -396,9 +414,12 @@ def _judged(
         sorting.mdp, sorting.weights[:tasks], labels, found.weights, assignments, demonstration
     )
     return (
-        evd, len(np.unique(assignments)), assignment_accuracy(labels, assignments),
-        adjusted_rand_index(labels, assignments), seconds,
-    )  # fmt: skip
+        evd,
+        len(np.unique(assignments)),
+        assignment_accuracy(labels, assignments),
+        adjusted_rand_index(labels, assignments),
+        seconds,
+    )
 
 
 def _measures(columns: Sequence[Sequence[tuple[float, ...]]]) -> Measures:
@@ -421,8 +442,12 @@ def _one_component(sorting: Sorting, tasks: int, stream: _Stream) -> float:
     nobody_told_apart = np.zeros(len(stream.labels), int)
     return min(
         expected_value_difference(
-            sorting.mdp, sorting.weights[:tasks], stream.labels, weights[None], nobody_told_apart,
+            sorting.mdp,
+            sorting.weights[:tasks],
+            stream.labels,
+            weights[None],
+            nobody_told_apart,
             stream.demonstration,
         )
         for weights in sorting.weights[:tasks]
-    )  # fmt: skip
+    )

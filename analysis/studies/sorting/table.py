@@ -149,10 +149,14 @@ def table_7_2(
             overall, choice = policy_accuracy(sorting.mdp, optimal[b], jnp.asarray(policy))
             rows.append(
                 SortingRow(
-                    method, behaviour, sort_belts(key, sorting, policy, belts, line), float(overall),
-                    float(choice), published.get(method.casefold(), {}).get(behaviour),
+                    method,
+                    behaviour,
+                    sort_belts(key, sorting, policy, belts, line),
+                    float(overall),
+                    float(choice),
+                    published.get(method.casefold(), {}).get(behaviour),
                 )
-            )  # fmt: skip
+            )
     return SortingTable(tuple(rows), belts, line, level)
 
 
@@ -293,13 +297,22 @@ def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str 
                     value, low, high = getattr(row.published, measure)(table.level)
                     panel.hlines(middle + 0.16, low, high, color=theirs, linewidth=1.2)
                     panel.plot(
-                        value, middle + 0.16, "D", markersize=6, markerfacecolor=theme.surface,
-                        markeredgecolor=theirs, markeredgewidth=1.4, clip_on=False,
-                    )  # fmt: skip
+                        value,
+                        middle + 0.16,
+                        "D",
+                        markersize=6,
+                        markerfacecolor=theme.surface,
+                        markeredgecolor=theirs,
+                        markeredgewidth=1.4,
+                        clip_on=False,
+                    )
             dress(
-                panel, theme, title=f"{behaviour}: {measure}", grid="x",
+                panel,
+                theme,
+                title=f"{behaviour}: {measure}",
+                grid="x",
                 x=_MEANING[measure] if i == len(names) - 1 else "",
-            )  # fmt: skip
+            )
             panel.set_xlim(0, 1.02)
             panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
         name_ticks(panels[i, 0], "y", range(len(methods)), methods, fontsize=TEXT)
@@ -308,10 +321,16 @@ def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str 
     handles = [
         Line2D([], [], color=ours, marker="o", markersize=6.5, linewidth=2.4, label="simulated belts"),
         Line2D(
-            [], [], color=theirs, marker="D", markersize=6, markerfacecolor=theme.surface, linewidth=1.2,
+            [],
+            [],
+            color=theirs,
+            marker="D",
+            markersize=6,
+            markerfacecolor=theme.surface,
+            linewidth=1.2,
             label="dissertation, one belt",
         ),
-    ]  # fmt: skip
+    ]
     head(figure, theme, handles, title=title)
     belts = f"simulated: {counted(table.belts, 'belt')}; dissertation: one belt, 24 onions"
     foot(figure, theme, f"bars: {table.level:.0%} intervals; {belts}")

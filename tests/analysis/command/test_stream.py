@@ -311,9 +311,13 @@ BAD = [
 ]
 FEW = LineLimits(size=400, steps=20)
 REASONS = [
-    "not valid JSON", "unknown state 'attic'", "trajectory 0, step 1: ", "at most 400 bytes",
-    "at most 20 steps; it has 30", "trajectory [01], step 2: ",
-]  # fmt: skip
+    "not valid JSON",
+    "unknown state 'attic'",
+    "trajectory 0, step 1: ",
+    "at most 400 bytes",
+    "at most 20 steps; it has 30",
+    "trajectory [01], step 2: ",
+]
 
 
 def spoilt(lines: list[str]) -> list[str]:
@@ -540,7 +544,7 @@ def test_a_killed_learner_loses_no_session_and_repeats_none(learner, lines, tmp_
     arguments = [
         "--mdp",
         str(tmp_path / "house.npz"),
-        "--demos",
+        "--demonstrations",
         str(tmp_path / "demos.jsonl"),
         "--seed",
         "3",

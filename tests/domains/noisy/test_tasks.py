@@ -63,17 +63,24 @@ def table_of(noise: SwapNoise | FeatureNoise) -> np.ndarray:
 def test_sorting_predicates_say_what_their_names_say() -> None:
     task = sorting_task()
     assert task.predicates.shape == (8, 22, 7)
-    expected = np.array([
+    expected = np.array(
         [
             [
-                s[1] == "0", a in (TO_CONVEYOR, TO_BIN, PICK), s[0] == "0",
-                s[2] == "1" and a in (TO_CONVEYOR, TO_BIN, PICK), a == TO_BIN, a == TO_BIN, a == TO_CONVEYOR,
-                a == TO_CONVEYOR,
+                [
+                    s[1] == "0",
+                    a in (TO_CONVEYOR, TO_BIN, PICK),
+                    s[0] == "0",
+                    s[2] == "1" and a in (TO_CONVEYOR, TO_BIN, PICK),
+                    a == TO_BIN,
+                    a == TO_BIN,
+                    a == TO_CONVEYOR,
+                    a == TO_CONVEYOR,
+                ]
+                for a in range(7)
             ]
-            for a in range(7)
+            for s in states_22()
         ]
-        for s in states_22()
-    ]).transpose(2, 0, 1)  # fmt: skip
+    ).transpose(2, 0, 1)
     np.testing.assert_array_equal(task.predicates, expected)
 
 
@@ -85,9 +92,9 @@ def test_exactly_two_sorting_predicates_duplicate_others() -> None:
 
 def test_patrol_predicates_say_what_their_names_say_and_none_is_constant() -> None:
     task, states = patrol_task(), instance(2).states
-    expected = np.array([
-        [[a == FORWARD, a == LEFT, state.row == 0, a == RIGHT] for a in range(4)] for state in states
-    ]).transpose(2, 0, 1)  # fmt: skip
+    expected = np.array(
+        [[[a == FORWARD, a == LEFT, state.row == 0, a == RIGHT] for a in range(4)] for state in states]
+    ).transpose(2, 0, 1)
     np.testing.assert_array_equal(task.predicates, expected)
     among_the_expert = (task.predicates * task.pair_distribution("natural", 5)).sum((1, 2))
     assert ((among_the_expert > 0.01) & (among_the_expert < 0.99)).all()
@@ -373,9 +380,15 @@ def test_sessions_scores_and_views_of_a_demonstration() -> None:
     task = patrol_task()
     view = instance(2).visibility(30)
     data = demonstrate_noisy(
-        jax.random.key(9), task, sessions=4, trajectories=3, steps=5, view=view, scores="calibrated",
+        jax.random.key(9),
+        task,
+        sessions=4,
+        trajectories=3,
+        steps=5,
+        view=view,
+        scores="calibrated",
         starts="natural",
-    )  # fmt: skip
+    )
     assert [part.kind.shape for part in data.seen.sessions(3)] == [(3, 5)] * 4
     in_view = np.asarray(view.in_view)[data.truth.state] == 1
     np.testing.assert_array_equal(data.seen.kind, np.where(in_view, SEEN, HIDDEN))

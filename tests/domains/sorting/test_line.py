@@ -39,9 +39,12 @@ def test_no_onion_is_lost(behaviour):
 def expected_of_picking(line: Line) -> np.ndarray:
     """Exact mean (TP, FP) of one set: onions are picked, inspected and placed until time is over."""
     seconds = {
-        "pick": line.pick_seconds, "inspect": line.inspect_seconds, "bin": line.place_seconds,
-        "back": line.place_seconds, "claim": line.claim_seconds,
-    }  # fmt: skip
+        "pick": line.pick_seconds,
+        "inspect": line.inspect_seconds,
+        "bin": line.place_seconds,
+        "back": line.place_seconds,
+        "claim": line.claim_seconds,
+    }
 
     @cache
     def ahead(phase: str, clock: float, bad: int, good: int, blemished: bool) -> tuple[float, float]:
@@ -89,9 +92,11 @@ def expected_of_picking(line: Line) -> np.ndarray:
 def expected_of_rolling(line: Line) -> np.ndarray:
     """Exact mean (TP, FP) of one set: roll, then claim, pick and bin what is listed, and roll again."""
     seconds = {
-        "roll": line.roll_seconds, "pick": line.pick_seconds, "bin": line.place_seconds,
+        "roll": line.roll_seconds,
+        "pick": line.pick_seconds,
+        "bin": line.place_seconds,
         "claim": line.claim_seconds,
-    }  # fmt: skip
+    }
 
     def chance(k: int, n: int, p: float) -> float:
         return comb(n, k) * p**k * (1 - p) ** (n - k)

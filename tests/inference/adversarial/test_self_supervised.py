@@ -212,9 +212,17 @@ def demonstration():
 @pytest.fixture(scope="module")
 def learner(agent):
     regression = Regression(
-        hidden=(32, 32), members=2, snippets=1000, shortest=5, longest=30, batch=32, iterations=500,
-        learning_rate=1e-3, penalty=1e-3, deviation=0.1,
-    )  # fmt: skip
+        hidden=(32, 32),
+        members=2,
+        snippets=1000,
+        shortest=5,
+        longest=30,
+        batch=32,
+        iterations=500,
+        learning_rate=1e-3,
+        penalty=1e-3,
+        deviation=0.1,
+    )
     return ssrr(
         agent,
         airl_discriminator(2, PUSH, state_only=True),

@@ -56,10 +56,12 @@ def sensor():
 @pytest.fixture(scope="module")
 def demonstration(mdp, sensor):
     """Three trajectories of each of two ways; some are hidden in places, a frame is lost, one is short."""
-    codes = np.concatenate([
-        np.asarray(simulated(jax.random.key(seed), mdp, jnp.array(w), sensor, 3))
-        for seed, w in ((2, [1.0, -3.0]), (3, [-1.0, 3.0]))
-    ])  # fmt: skip
+    codes = np.concatenate(
+        [
+            np.asarray(simulated(jax.random.key(seed), mdp, jnp.array(w), sensor, 3))
+            for seed, w in ((2, [1.0, -3.0]), (3, [-1.0, 3.0]))
+        ]
+    )
     codes[1, 2] = [3, -1, -1]
     codes[4, 4:] = [0, -1, -1]
     perceived, _ = perceive(mdp, sensor, codes)

@@ -41,9 +41,13 @@ def mdp():
     features[0, :, 0] = 1
     features[:, 1, 1] = 1
     return TabularMDP.from_dense(
-        transitions, features, discount=0.8,
-        states=("north", "east", "south", "west"), actions=("on", "back"), feature_names=("home", "turned"),
-    )  # fmt: skip
+        transitions,
+        features,
+        discount=0.8,
+        states=("north", "east", "south", "west"),
+        actions=("on", "back"),
+        feature_names=("home", "turned"),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -186,9 +190,15 @@ def test_draws_carry_names(idata, mdp, demonstration):
 def test_sampler_statistics_have_arviz_names(idata):
     stats = idata.sample_stats
     names = {
-        "lp", "energy", "acceptance_rate", "step_size", "n_steps",
-        "tree_depth", "reached_max_treedepth", "diverging",
-    }  # fmt: skip
+        "lp",
+        "energy",
+        "acceptance_rate",
+        "step_size",
+        "n_steps",
+        "tree_depth",
+        "reached_max_treedepth",
+        "diverging",
+    }
     assert names <= set(stats.data_vars)
     assert (stats.n_steps < 2**stats.tree_depth).all()
     assert np.isfinite(az.bfmi(idata)).all()

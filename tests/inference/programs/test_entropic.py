@@ -63,10 +63,13 @@ def test_the_optimum_is_that_of_a_general_solver():
         loss = jax.value_and_grad(lambda p, n=counts, s=strength: -entropic_objective(p, n, s))
         optimum = minimize(
             lambda p, loss=loss: tuple(np.asarray(part) for part in loss(jnp.asarray(p))),
-            np.full(4, 0.25), jac=True, method="SLSQP", bounds=[(1e-9, 1.0)] * 4,
+            np.full(4, 0.25),
+            jac=True,
+            method="SLSQP",
+            bounds=[(1e-9, 1.0)] * 4,
             constraints={"type": "eq", "fun": lambda p: p.sum() - 1, "jac": np.ones_like},
             options={"ftol": 1e-15, "maxiter": 500},
-        )  # fmt: skip
+        )
         assert optimum.success
         np.testing.assert_allclose(solve(counts, strength), optimum.x, atol=1e-6)
         assert float(objective(solve(counts, strength), counts, strength)) >= -optimum.fun - 1e-10

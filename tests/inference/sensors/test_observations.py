@@ -32,9 +32,9 @@ S, A = 4, 2
 SA = S * A
 VIEW = np.array([1.0, 0.4, 0.7, 0.0])
 # A predicate, a label, and a predicate that makes two pairs equal in everything.
-FEATURES = np.array([
-    [[0, 1], [0, 1], [0, 1], [0, 1]], [[0, 0], [0, 0], [1, 1], [2, 2]], [[1, 1], [1, 0], [0, 0], [1, 1]]
-])  # fmt: skip
+FEATURES = np.array(
+    [[[0, 1], [0, 1], [0, 1], [0, 1]], [[0, 0], [0, 0], [1, 1], [2, 2]], [[1, 1], [1, 0], [0, 0], [1, 1]]]
+)
 LOGITS = np.array([1.1, 0.6, -0.4])
 # One of the two equal pairs cannot be reported, nor can one that nothing equals.
 MASK = np.array([[0, 1], [1, 1], [1, 1], [0, 1]], bool)
@@ -42,11 +42,9 @@ EVERYTHING = np.ones((S, A), bool)
 MODES = ["none", "stepwise", "averaged"]
 ROWS = [
     [(SEEN, 0, 1, 0.8), (SEEN, 1, 0, 0.0), (SEEN, 2, UNKNOWN, 0.6), (HIDDEN, UNKNOWN, UNKNOWN, np.nan)],
-    [(SEEN, 1, 0, np.nan), (LOST, UNKNOWN, UNKNOWN, np.nan), (SEEN, UNKNOWN, 1, np.nan),
-     (SEEN, 2, 0, 0.3)],
-    [(SEEN, UNKNOWN, UNKNOWN, 0.9), (SEEN, 3, 1, 1.0), (SEEN, 1, 0, 0.55),
-     (PAD, UNKNOWN, UNKNOWN, np.nan)],
-]  # fmt: skip
+    [(SEEN, 1, 0, np.nan), (LOST, UNKNOWN, UNKNOWN, np.nan), (SEEN, UNKNOWN, 1, np.nan), (SEEN, 2, 0, 0.3)],
+    [(SEEN, UNKNOWN, UNKNOWN, 0.9), (SEEN, 3, 1, 1.0), (SEEN, 1, 0, 0.55), (PAD, UNKNOWN, UNKNOWN, np.nan)],
+]
 # Without those that leave something open, which are computed otherwise.
 NAMED = [
     [(kind, 2, 1, c) if kind == SEEN and UNKNOWN in (s, a) else (kind, s, a, c) for kind, s, a, c in row]
@@ -344,9 +342,14 @@ def problem(seed: int, mask: np.ndarray, scored: float = 0.6, clarity: float = 0
 
 def by_scipy(case: Problem, slack: float) -> np.ndarray:
     found = minimize(
-        case.dual, np.zeros(6), (slack,), jac=True, method="L-BFGS-B", bounds=[(0, LIMIT)] * 6,
+        case.dual,
+        np.zeros(6),
+        (slack,),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(0, LIMIT)] * 6,
         options={"maxiter": 5000, "maxfun": 20000, "ftol": 1e-16, "gtol": 1e-11, "maxcor": 30},
-    )  # fmt: skip
+    )
     return found.x[:3] - found.x[3:]
 
 

@@ -205,26 +205,39 @@ NAMED = walk(states=("bin", "table", "eye"), actions=("stay", "go"))
 MASKED = walk(available=np.array([[True, False], [True, True], [True, True]]))
 IMPOSSIBLE = {
     "cannot start there": (
-        Sensor(), NAMED, [(1, 0)],
+        Sensor(),
+        NAMED,
+        [(1, 0)],
         r"trajectory 0, step 0: .*: seen state 'table' \(1\), action 'stay' \(0\); the initial distribution",
     ),
     "no transition": (
-        Sensor(), NAMED, [(0, 1), (1, 0), (2, 0)],
+        Sensor(),
+        NAMED,
+        [(0, 1), (1, 0), (2, 0)],
         r"trajectory 0, step 2: .*: seen state 'eye' \(2\).*; no transition leads there",
     ),
     "no transition through a gap": (
-        Sensor(), MDP, [(0, 1), None, (0, 0)], r"step 2: .*seen state 0, action 0; no transition",
+        Sensor(),
+        MDP,
+        [(0, 1), None, (0, 0)],
+        r"step 2: .*seen state 0, action 0; no transition",
     ),
     "no action": (Sensor(), MASKED, [(0, 1)], r"step 0: .*; the action is not available there"),
     "seen out of view": (Visibility([0, 1, 1]), MDP, [(0, 0)], r"step 0: .*; the sensor excludes it"),
     "hidden in full view": (
-        Visibility([1, 1, 1]), MDP, ["hidden"], r"step 0: .*: hidden; every state is in view",
+        Visibility([1, 1, 1]),
+        MDP,
+        ["hidden"],
+        r"step 0: .*: hidden; every state is in view",
     ),
     "hidden where it could not be": (
-        Visibility([1, 1, 0]), MDP, [(0, 0), "hidden"], r"step 1: .*: hidden; no transition leads there",
+        Visibility([1, 1, 0]),
+        MDP,
+        [(0, 0), "hidden"],
+        r"step 1: .*: hidden; no transition leads there",
     ),
     "never confused": (NOISY, MDP, [(0, 0), {"s": 2}], r"step 1: .*: seen state 2; no transition"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", IMPOSSIBLE)
