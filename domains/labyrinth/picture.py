@@ -17,7 +17,7 @@ from .process import HOME, LEVELS, N_NODES, WATER_PORT, Labyrinth, parent_of
 
 
 def maze_layout() -> np.ndarray:
-    """Where nodes and home lie, ``[N_NODES + 1, 2]`` as (x, y): a tree of Hs, left and right as walked."""
+    """Place nodes and home, ``[N_NODES + 1, 2]`` as (x, y): a tree of Hs, left and right as walked."""
     places = np.zeros((N_NODES + 1, 2))
     places[HOME] = 0.0, -16.0
     for node in range(1, N_NODES):
@@ -35,7 +35,7 @@ def _ahead(places: np.ndarray, node: int) -> np.ndarray:
 
 
 def labyrinth_scene(labyrinth: Labyrinth) -> Scene:
-    """The maze with its water port and the mouse, nose where it is going."""
+    """Draw the maze with its water port and the mouse, which faces its destination."""
     places = maze_layout()
     axes = new_canvas(-15.5, 15.5, -17.5, 15.5, 16, caption=3)
     axes.add_patch(Rectangle((-15.5, -17.5), 31, 33, facecolor=WALL, zorder=0))
@@ -77,7 +77,7 @@ _DROP = np.array(
 
 
 def _previous_nodes(labyrinth: Labyrinth) -> np.ndarray:
-    """The node each state was entered from."""
+    """Find the node from which each state was entered."""
     previous = np.full(len(labyrinth.node), -1)
     successors = np.asarray(labyrinth.mdp.successors)[..., 0]
     for s, a in np.argwhere(np.asarray(labyrinth.mdp.available)):
@@ -85,7 +85,7 @@ def _previous_nodes(labyrinth: Labyrinth) -> np.ndarray:
     start = np.asarray(labyrinth.mdp.initial) > 0
     previous[start] = HOME
     previous[labyrinth.node == HOME] = 0
-    # What nothing leads to was entered from above.
+    # A state without predecessor was entered from above.
     unknown = previous < 0
     previous[unknown] = [parent_of(int(n)) for n in labyrinth.node[unknown]]
     return previous

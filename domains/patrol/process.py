@@ -56,7 +56,7 @@ class State(NamedTuple):
 
 
 class Breach(NamedTuple):
-    """Where the learner starts, which way it faces, where it wants to go, and the cells it may use."""
+    """Breach of a patrol: the learner's start and heading, its goal, and the cells it may use."""
 
     cells: tuple[Cell, ...]
     start: State
@@ -85,7 +85,7 @@ class Patrol(NamedTuple):
 
     @property
     def cells(self) -> tuple[Cell, ...]:
-        """The cells patrollers can stand on, in reading order."""
+        """Cells of the patrollers, row by row."""
         return tuple(sorted({state.cell for state in self.states}))
 
     @property
@@ -95,7 +95,7 @@ class Patrol(NamedTuple):
         return np.array([index[state.cell] for state in self.states])
 
     def visibility(self, observability: int | None = None) -> Visibility:
-        """The learner's view at an observability named by the dissertation (30, 70, 100 percent, ...).
+        """Return the visibility at an observability that the dissertation names (30, 70, 100 percent, ...).
 
         The default is the instance's own. Raises ``ValueError`` naming the degrees this instance has.
         """
@@ -106,12 +106,12 @@ class Patrol(NamedTuple):
         return Visibility(self.views[observability])
 
     def expert_policy(self) -> Float[np.ndarray, "S A"]:
-        """The patrollers' optimal policy; ties go right before left, as in the released code."""
+        """Compute the patrollers' optimal policy; ties go right before left, as in the released code."""
         return greedy_policy(self.mdp, self.weights)
 
 
 def greedy_policy(mdp: TabularMDP, weights: Float[np.ndarray, " K"]) -> Float[np.ndarray, "S A"]:
-    """The deterministic policy that is optimal under some weights, ties broken by :func:`break_ties`."""
+    """Compute the deterministic optimal policy under some weights, ties broken by :func:`break_ties`."""
     return break_ties(np.asarray(_optimal(mdp, jnp.asarray(weights, float))))
 
 
@@ -128,7 +128,7 @@ def break_ties(optimal: Bool[np.ndarray, "S A"]) -> Float[np.ndarray, "S A"]:
 
 
 class Interaction(NamedTuple):
-    """What two patrollers do when they meet: an equilibrium of the passing game, played for some steps.
+    """Meeting of two patrollers: an equilibrium of the passing game, played for some steps.
 
     ``equilibrium`` holds each patroller's action; forward means to follow its own policy. In the steps
     before the last of ``length`` both wait. ``length`` 0 means they pass through each other.
@@ -211,7 +211,7 @@ def demonstrate(
     steps: int = 5,
     interaction: Interaction = Interaction(),  # noqa: B008 (immutable)
 ) -> tuple[Demonstration, ...]:
-    """What the learner perceives of each patroller: ``sessions`` consecutive windows of ``steps`` pairs.
+    """Simulate the learner's observation of each patroller: ``sessions`` windows of ``steps`` pairs in a row.
 
     The patrollers start in states drawn from the MDP's initial distribution and follow their optimal
     policies. Row ``i`` of each demonstration is session ``i`` (section 7.4.1: five pairs a session). An

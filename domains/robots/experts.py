@@ -43,7 +43,7 @@ TARGETS = {"hopper": 2810.0, "walker2d": 2700.0, "half-cheetah": 2507.0, "mounta
 
 
 class Recipe(NamedTuple):
-    """How an expert is made.
+    """Training settings of an expert.
 
     Fields
     ------
@@ -99,7 +99,7 @@ class Demonstrations(NamedTuple):
 
     @property
     def recording(self) -> Recording:
-        """As learners take it."""
+        """Recording that learners take."""
         return recording(
             [o[:end] for o, end in zip(self.observations, self.lengths, strict=True)],
             [a[:end] for a, end in zip(self.actions, self.lengths, strict=True)],
@@ -108,7 +108,7 @@ class Demonstrations(NamedTuple):
 
 
 def expert_task(name: str) -> Task:
-    """The task an expert is recorded at: mountain car, or a robot at fixed length.
+    """Make the task on which an expert is recorded: mountain car, or a robot at fixed length.
 
     Raises ``ValueError`` for a name that is not in :data:`EXPERTS`.
     """
@@ -117,7 +117,7 @@ def expert_task(name: str) -> Task:
 
 
 def expert_agent(name: str, steps: int) -> PPO:
-    """The agent that learns to be the expert ``name``, its learning rate falling to zero over ``steps``.
+    """Make the agent that learns to be the expert ``name``; its learning rate falls to zero over ``steps``.
 
     A robot's episodes end when it falls, and mountain car's are longer than when recorded, or it would find
     the flag too rarely. Raises as :func:`expert_task`.
@@ -131,7 +131,7 @@ def expert_agent(name: str, steps: int) -> PPO:
 def train_expert(
     name: str, key: Array, steps: int, report: Callable[[Training], None] | None = None
 ) -> tuple[Policy, Training]:
-    """A policy trained for ``steps`` steps by the true reward, and how that went.
+    """Train a policy for ``steps`` steps by the true reward; return it and the course of the training.
 
     ``report`` is called with each part of the training, every 50 rollouts. Raises as :func:`expert_task`.
     """
