@@ -8,6 +8,7 @@
 ``i2rl/PickInspectPlace-v0``            onion sorting, 22 states
 ``i2rl/ObjectWorld-v0``                 a walled grid; ``layout`` seeds its walls
 ``i2rl/Breach2-v0``, ``Breach3-v0``     the learner's path past the patrollers; ``observability`` its view
+======================================  ================================================================
 
 Those with a :class:`TabularMDP` are :class:`TabularEnv` and take ``weights``, the reward ``weights .
 phi(s, a)`` (by default the domain's true ones). Their episodes never terminate; they are truncated after the

@@ -31,7 +31,7 @@ def median_seconds(action: Callable[[], Any], replications: int = 5) -> float:
 
 
 def machine() -> dict[str, Any]:
-    """What the numbers were measured on."""
+    """Describe the machine of the measurements."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     return {"cores": os.cpu_count(), "python": platform.python_version(), "load": round(load, 2)}
 

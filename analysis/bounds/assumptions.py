@@ -1,4 +1,4 @@
-"""What a bound rests on: assumptions that are checked, not assumed.
+"""Assumptions of a bound, checked where possible.
 
 The theorems ask for weights and features in [0, 1], a soft expert, whole independent trajectories, and an
 M-step that met its threshold. A :class:`Bound` carries these premises with it; :func:`check` decides those
@@ -36,7 +36,7 @@ class BoundNotGuaranteed(ValueError):
 
 
 class Bound(NamedTuple):
-    """What a theorem promises.
+    """Promise of a theorem.
 
     Fields
     ------
@@ -74,7 +74,7 @@ class Bound(NamedTuple):
         return tuple(a for a in self.assumptions if a.holds is None)
 
     def assuming(self, **decided: bool) -> Bound:
-        """The bound with assumptions decided by name: what its user knows and no run can show.
+        """Return the bound with assumptions stated by name, which the user knows and no simulation can show.
 
         Raises ``ValueError`` for a name that is not one of its assumptions, and for one that was found not
         to hold.
@@ -98,7 +98,7 @@ class Bound(NamedTuple):
         )
 
     def guarantee(self) -> str:
-        """The bound in a sentence, with whatever it still takes on trust.
+        """Write the bound in a sentence, with the assumptions that it still takes on trust.
 
         Raises :class:`BoundNotGuaranteed` if an assumption does not hold or the confidence is zero.
         """
@@ -254,7 +254,7 @@ def _theorems_program(learner: Learner, bound: Bound) -> tuple[bool, str]:
 
 
 def _solved(learner: Learner, state: Any, bound: Bound) -> tuple[bool, str]:
-    """Whether the weights are feasible, and optimal up to a thousandth of the bound."""
+    """Test whether the weights are feasible, and optimal up to a thousandth of the bound."""
     if learner.configuration.get("statistic") != "features":
         return False, "another program was solved"
     mdp, weights, scale = learner.mdp, state.weights, feature_scale(learner.mdp)

@@ -1,4 +1,4 @@
-"""Do the bounds hold, and how loose are they? Replications against each theorem's promise.
+"""Coverage and looseness of the bounds: replications against each theorem's promise.
 
 The expert obeys the model the theorems assume (the soft policy of weights in [0, 1]^K), trajectories are
 independent, and the program is the theorems': the one place where every assumption can be made true, so
@@ -56,7 +56,7 @@ class Setting(NamedTuple):
 
 
 class Coverage(NamedTuple):
-    """How a bound fared in replications.
+    """Coverage of a bound in replications.
 
     Fields
     ------
@@ -83,12 +83,12 @@ class Coverage(NamedTuple):
 
     @property
     def looseness(self) -> float:
-        """How many times larger the bound is than the quantile seen."""
+        """Ratio of the bound to the quantile observed."""
         return self.bound / self.quantile
 
 
 class Expert(NamedTuple):
-    """What is known exactly of an expert who obeys the soft model."""
+    """Exact properties of an expert who obeys the soft model."""
 
     weights: Float[Array, " K"]
     log_policy: Float[Array, "S A"]
@@ -125,7 +125,7 @@ def simulate_features(
 def simulate_codes(
     key: Array, mdp: TabularMDP, expert: Expert, sensor: AnySensor, length: int, replications: int, size: int
 ) -> Int[Array, "replications size L 3"]:
-    """What a sensor lets through of independent trajectories, as :attr:`Demonstration.codes`."""
+    """Simulate the observation of independent trajectories, as :attr:`Demonstration.codes`."""
 
     def one(key: Array) -> Int[Array, "L 3"]:
         walk, look = jax.random.split(key)
@@ -210,12 +210,12 @@ def expected_gaps(
 def expected_gap(
     mdp: TabularMDP, expert: Expert, weights: Float[Array, " K"], values: Float[Array, " S"]
 ) -> Float[Array, ""]:
-    """The expert's expected log-likelihood less that of other weights, given their soft values."""
+    """Compute the expert's expected log-likelihood less that of other weights, given their soft values."""
     return (expert.weights - weights) @ expert.features - mdp.initial @ (expert.values - values)
 
 
 def ignorance_gap(mdp: TabularMDP, weights: Float[Array, " K"]) -> float:
-    """The gap of zero weights: a bound above it promises less than what knowing nothing achieves."""
+    """Compute the gap of zero weights: a bound above it promises less than ignorance achieves."""
     expert = expert_of(mdp, jnp.asarray(weights))
     nothing = soft_plan(mdp, jnp.zeros((mdp.n_states, mdp.n_actions)))
     return float(expected_gap(mdp, expert, jnp.zeros(mdp.n_features), nothing.values))
@@ -333,7 +333,7 @@ def learned_gaps(
     slack: float,
     batch: int = 25,
 ) -> Float[np.ndarray, " replications"]:
-    """Expected gaps of LME-I2RL with the features statistic, which believes in the sensor ``assumed``.
+    """Compute expected gaps of LME-I2RL with the features statistic and the sensor ``assumed``.
 
     ``slack`` is the ``epsilon`` of its program; ``size`` trajectories come in one session.
     """
@@ -386,7 +386,7 @@ def regret_coverage(
 
 
 def coverage_table(rows: Sequence[Coverage]) -> pd.DataFrame:
-    """The rows with their looseness, labelled."""
+    """Tabulate the rows with their looseness, labelled."""
     table = pd.DataFrame([{**row._asdict(), "looseness": row.looseness} for row in rows])
     return table.set_index(["setting", "result"])
 

@@ -1,4 +1,4 @@
-"""How far reports, and posteriors over what was done, can be apart if an observation model is not exact.
+"""Distances between observations, and between posteriors of behaviour, under an inexact observation model.
 
 ``p_j`` are the reliabilities of ``|Psi|`` predicates (Eq. 6.5), known within ``epsilon_o``. Distances are
 total variations, by which the expectation of a value in [0, 1] can change.
@@ -17,7 +17,7 @@ from .checks import counted, positive
 
 
 class Perception(NamedTuple):
-    """What the bounds ask about perception.
+    """Properties of perception that the bounds need.
 
     ``draws`` used to estimate the observation model (``n_o``), its error ``epsilon_o``, the number of
     ``predicates`` (``|Psi|``), and the ``longest`` trajectory's steps (``L``).
@@ -30,7 +30,7 @@ class Perception(NamedTuple):
 
 
 def report_distance(perception: Perception, reliabilities: Float[np.ndarray, " J"] | None = None) -> float:
-    """How far the reports of one and the same trajectory can be apart under true and estimated reliabilities.
+    """Bound the distance between observations of one trajectory under true and estimated reliabilities.
 
     Total variation, at most ``1 - (1 - epsilon_o)^(L |Psi|) <= L |Psi| epsilon_o`` (reports can be coupled so
     that each predicate of each step differs with probability ``epsilon_o``). With the estimated
@@ -49,7 +49,7 @@ def report_distance(perception: Perception, reliabilities: Float[np.ndarray, " J
 
 
 def posterior_distance(perception: Perception, reliabilities: Float[np.ndarray, " J"]) -> float:
-    """How far posteriors over trajectories can be apart under true and estimated reliabilities, surely.
+    """Bound the distance between posteriors over trajectories under true and estimated reliabilities, surely.
 
     Total variation, at most ``tanh(L / 4 sum_j |logit p_j - logit p_hat_j|)``, whatever was reported,
     whatever the weights, and however the estimate came about: likelihood ratios of two trajectories change by
@@ -64,7 +64,7 @@ def posterior_distance(perception: Perception, reliabilities: Float[np.ndarray, 
 
 
 class ModelDistance(NamedTuple):
-    """How far two observation models are apart, at one step.
+    """Distance of two observation models at one step.
 
     Fields
     ------
@@ -124,7 +124,7 @@ def _error(perception: Perception) -> float:
 def _intervals(
     perception: Perception, reliabilities: Float[np.ndarray, " J"]
 ) -> tuple[Float[np.ndarray, " J"], Float[np.ndarray, "2 J"]]:
-    """The estimates, and the ends of what each true reliability may be."""
+    """Return the estimates and the ends of their ranges of true reliabilities."""
     error, p = _error(perception), np.asarray(reliabilities, float)
     if p.shape != (perception.predicates,) or not ((p >= 0) & (p <= 1)).all():
         raise ValueError(f"reliabilities are {perception.predicates} probabilities, got {reliabilities}")

@@ -94,7 +94,7 @@ def sample_size_plot(
 
 
 def looseness_plot(rows: Sequence[Coverage], *, theme: Theme = LIGHT, title: str = "") -> Figure:
-    """What each bound promises beside the quantile of what happened, one line a bound.
+    """Draw the promise of each bound beside the quantile observed, one line a bound.
 
     Bounds of one picture should share their unit (nats per trajectory).
     """

@@ -42,7 +42,7 @@ from .theorems import error_for
 
 
 def noise_of(setting: Setting) -> FeatureNoise:
-    """The setting's noise on predicates; ``ValueError`` for another sensor."""
+    """Return the setting's noise on predicates; ``ValueError`` for another sensor."""
     if not isinstance(setting.sensor, FeatureNoise):
         raise ValueError(f"the study is of FeatureNoise, but the sensor is a {type(setting.sensor).__name__}")
     return setting.sensor
@@ -197,7 +197,7 @@ def learned_perception_coverage(
 def posterior_change(
     key: Array, setting: Setting, epsilon_o: float, replications: int, size: int
 ) -> list[Coverage]:
-    """The proof's step from the true model to one within ``epsilon_o`` of it, said to hold of every report.
+    """Check the proof's step from the true model to one within ``epsilon_o`` of it, for every observation.
 
     Reliabilities are off by ``epsilon_o`` to a random side. What is seen is the largest change of a feature's
     ``(1 - gamma) phi_hat`` between the two posteriors, over ``size`` trajectories of a run and of its worst

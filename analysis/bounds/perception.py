@@ -213,7 +213,7 @@ def noisy_confidence(lemma: Bound, n_features: int, discount: float, norm: float
 def perception_needed(
     n_features: int, predicates: int, longest: int, error: float, confidence: float
 ) -> pd.DataFrame:
-    """Data for ``(1 - gamma) |E[phi_k] - phi_hat_k| <= error``, as printed and corrected.
+    """Compute the data for ``(1 - gamma) |E[phi_k] - phi_hat_k| <= error``, as printed and corrected.
 
     ``error`` and what is left of ``confidence`` are shared equally by the terms. Returns a table with rows
     ``printed`` and ``corrected`` and columns ``trajectories``, ``draws`` (of completions), ``reports``

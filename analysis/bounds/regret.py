@@ -52,7 +52,8 @@ from ..judging.metrics import quantile_band
 def expected_visits(
     mdp: TabularMDP, policy: Float[Array, "S A"], length: int, windows: int = 1
 ) -> Float[Array, "S A"]:
-    """Expected visits of one trajectory: the mean over ``windows`` consecutive ones of ``length`` steps.
+    """Compute the expected visits of one trajectory: the mean over ``windows`` consecutive ones of ``length``
+    steps.
 
     The first begins in the initial distribution and every other where the one before ended, as fragments of
     one long walk do; ``windows = 1`` is for trajectories that all start anew. Raises ``ValueError`` for
@@ -78,7 +79,7 @@ def excess_risk(
     visits: Float[Array, "S A"],
     weights: Float[Array, " K"],
 ) -> Float[Array, ""]:
-    """``sum_s d(s) KL(pi(.|s) || pi_theta(.|s))``: nats per trajectory lost by predicting with ``weights``.
+    """Compute ``sum_s d(s) KL(pi(.|s) || pi_theta(.|s))``: nats per trajectory lost by ``weights``.
 
     ``policy`` is the expert's (any policy; zero risk is within reach only if some weights have it as their
     soft policy), ``visits [S, A]`` its expected visits. With the discounted occupancy and the soft policy
@@ -194,7 +195,8 @@ def sure_bound(beta: Float[np.ndarray, " T"], expert_weights: Float[np.ndarray, 
 
 
 def last_confident_session(c: float, session_size: int, n_features: int, discount: float) -> int:
-    """The last session of Theorem 5 with ``delta_i < 1``, for ``session_size`` trajectories in every session.
+    """Find the last session of Theorem 5 with ``delta_i < 1``, for ``session_size`` trajectories in every
+    session.
 
     ``delta_i = 2 K exp(-2 m i (c (1 - gamma) / i)^2)`` grows with ``i`` towards ``2 K > 1`` and passes 1 at
     ``i = 2 m c^2 (1 - gamma)^2 / log 2K``. From the next session on the theorem's confidence, a product

@@ -123,7 +123,7 @@ def _theorem(table: pd.DataFrame, epsilon: float, epsilon_s: float, features: in
 
 
 def summary(answer: Answer) -> dict[str, Any]:
-    """The answer as plain numbers and words, for JSON."""
+    """Return the answer as plain numbers and words, for JSON."""
     return {
         "confidence": answer.confidence,
         "violated": [a.name for a in answer.bound.violated],
@@ -139,7 +139,7 @@ def summary(answer: Answer) -> dict[str, Any]:
 
 
 def print_answer(answer: Answer, console: Console) -> None:
-    """The answer as two tables and, where the expert is known, what the error means for it."""
+    """Print the answer as two tables and, for a known expert, the meaning of the error."""
     from rich.table import Table
 
     bound = answer.bound

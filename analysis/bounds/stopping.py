@@ -30,7 +30,7 @@ NEVER = 0
 
 
 class Histories(NamedTuple):
-    """What ``R`` streams of ``T`` sessions reported, and how good they were.
+    """Observations of ``R`` streams of ``T`` sessions, and their accuracy.
 
     Fields
     ------
@@ -170,7 +170,7 @@ class Sweep(NamedTuple):
     verdicts: tuple[Verdict, ...]
 
     def at(self, rho: float) -> Verdict:
-        """The verdict at a tolerance of the sweep."""
+        """Return the verdict at a tolerance of the sweep."""
         match = np.flatnonzero(np.isclose(self.rho, rho))
         if not len(match):
             raise ValueError(f"{self.name} was not run at rho = {rho:g}")

@@ -81,7 +81,7 @@ def error_for(size: float, delta: float, events: float) -> float:
 
 
 def sure_gap(epsilon: float, n_features: int, discount: float, norm: float | None = None) -> float:
-    """What the program's solution surely loses on its own data: ``beta |theta_E|_1`` nats per trajectory.
+    """Bound the solution's gap on its own data, surely: ``beta |theta_E|_1`` nats per trajectory.
 
     ``norm`` is ``|theta_E|_1``; without it the ``K`` of weights in [0, 1]. Comes from optimality alone:
     ``LL(theta) - beta |theta|_1`` is largest at the solution.
@@ -228,7 +228,7 @@ def no_regret_sizes(c: float, sessions: int, delta: float, n_features: int, disc
 
 
 class Monotonicity(NamedTuple):
-    """Whether log-likelihoods rise from session to session, and the largest fall (nats per trajectory).
+    """Rise of log-likelihoods from session to session, and the largest fall (nats per trajectory).
 
     ``premise`` is ``|Y_i| / |Y_{1:i-1}|`` at the last session, which the lemmas want to be small.
     """
@@ -290,7 +290,7 @@ def observed_bound(
     *,
     predictable: bool = True,
 ) -> ObservedBound:
-    """A bound that is usually tighter than Theorem 1's: from the observed spread of each feature.
+    """Compute a bound from the observed spread of each feature, usually tighter than Theorem 1's.
 
     The union bound over features of an empirical Bernstein interval each; features that vary little get
     little slack, and the error is the sum of what each contributes, ``2 sum_k slack_k |theta_E,k|``, by the
@@ -361,7 +361,7 @@ def demonstrations_needed(
     epsilon_s: float = 0.05,
     deviations: Float[np.ndarray, " K"] | None = None,
 ) -> pd.DataFrame:
-    """How many trajectories are enough, by the theorem and by the tighter bounds.
+    """Compute how many trajectories are enough, by the theorem and by the tighter bounds.
 
     Every row is for the same log-likelihood error, Theorem 2's ``4 K epsilon_l / (1 - gamma)`` nats, with
     the same confidence; ``delta`` and ``delta_s`` share what is left of it equally. Rows differ in what they

@@ -57,7 +57,7 @@ def reported_errors() -> Iterator[None]:
 
 @contextmanager
 def progress(quiet: bool) -> Iterator[Any]:
-    """A progress bar on a terminal; ``advance(description, fraction)``, nothing elsewhere."""
+    """Show progress on a terminal; yield ``advance(description, fraction)``, silent elsewhere."""
     if quiet or not sys.stderr.isatty():
         yield lambda description, fraction: None
         return

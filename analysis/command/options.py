@@ -9,12 +9,12 @@ import typer
 
 
 def count_option(help: str, least: int = 1, most: int = 10**7) -> Any:
-    """A whole number that can be counted to."""
+    """Make an option for a positive whole number."""
     return typer.Option(min=least, max=most, help=help)
 
 
 def real_option(help: str, least: float | None = None, most: float | None = None) -> Any:
-    """A finite number; a range alone would let NaN pass."""
+    """Make an option for a finite number; a range alone would let NaN pass."""
     return typer.Option(min=least, max=most, help=help, callback=_finite)
 
 
@@ -25,7 +25,7 @@ def _finite(value: float | None) -> float | None:
 
 
 def seed_option(help: str) -> Any:
-    """A seed; NumPy, JAX and PyMC take 32 bits without a sign."""
+    """Make an option for a seed; NumPy, JAX and PyMC take 32 bits without a sign."""
     return typer.Option(min=0, max=2**32 - 1, help=help)
 
 

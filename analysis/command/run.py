@@ -37,7 +37,7 @@ class MultiTask(StrEnum):
 
 
 class NoisyStarts(StrEnum):
-    """Where trajectories of ``run noisy-sorting`` and ``run noisy-patrol`` start."""
+    """Starts of the trajectories of ``run noisy-sorting`` and ``run noisy-patrol``."""
 
     all = "all"
     natural = "natural"
@@ -152,7 +152,7 @@ def run_label_bias(
     ),
     as_json: Json = False,
 ) -> None:
-    """Does a likelier trajectory earn more? Table 5.1, in many Object Worlds and under many assumptions."""
+    """Test whether likelier trajectories earn more: Table 5.1 in many Object Worlds and settings."""
     from ..studies.label_bias import page as label_bias_page
     from ..studies.label_bias import study as label_bias
 

@@ -76,7 +76,7 @@ def _followed(file: FileIO, path: str, say: Callable[[str], None], poll_seconds:
 
 
 def _is_rewritten(file: FileIO, tail: bytes) -> bool:
-    """Whether the file is shorter than what was read of it, or has other bytes there."""
+    """Test whether the file has other bytes, or fewer, where it was read."""
     return os.pread(file.fileno(), len(tail), file.tell() - len(tail)) != tail
 
 
@@ -172,7 +172,7 @@ def positioned(lines: Iterable[str | Line]) -> Iterator[Line]:
 
 
 def unread(lines: Iterable[Line], journal: Journal) -> Iterator[Line]:
-    """The lines that the journal has not learned from.
+    """Yield the lines that the journal has not learned from.
 
     Raises :class:`JournalError`, before the first of them, where the earlier lines are not those that were
     learned from.

@@ -63,7 +63,7 @@ class Estimates(NamedTuple):
         return Table([title or headings[0], *headings[1:]], rows, caption)
 
     def summary(self) -> list[dict[str, Any]]:
-        """The same as plain data; None where a weight is not determined."""
+        """Return the same as plain data; None for a weight that is not determined."""
         return [
             {
                 "feature": name,
@@ -78,7 +78,7 @@ class Estimates(NamedTuple):
 
 
 def laplace_errors(information: Float[np.ndarray, "K K"]) -> Float[np.ndarray, " K"]:
-    """Standard errors of the normal distribution with this information (its inverse covariance).
+    """Compute standard errors of the normal distribution with this information (its inverse covariance).
 
     Infinite for weights that a direction without positive information moves.
     """

@@ -32,7 +32,7 @@ def policy_map(
     theme: Theme = LIGHT,
     title: str = "Learned policy",
 ) -> Figure:
-    """What a policy most probably does in every state, and where that is not what the expert would do.
+    """Draw the likeliest action of a policy in every state, and mark where the expert's differs.
 
     Each cell carries four glyphs, one per heading, at the side faced: an arrow (forward), a hook (turn) or
     a dot (stop). Every optimal action of the expert counts as agreement; ties of ``policy`` go as in the
@@ -81,7 +81,7 @@ _BEND = [(0.15, -0.09), (0.24, -0.09), (0.30, -0.075), (0.335, -0.03), (0.34, 0.
 
 
 def _arrow(line: Sequence[tuple], head: Sequence[tuple]) -> Path:
-    """A line and a filled triangle at its end."""
+    """Make a line and a filled triangle at its end."""
     there_and_back = [*line, *reversed(line)]
     codes = [Path.MOVETO] + [Path.LINETO] * (len(there_and_back) - 1)
     triangle = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
@@ -178,7 +178,7 @@ def _draw_floor(
 
 
 def _draw_key(axes: Axes, theme: Theme, marked: bool, occluded: bool) -> None:
-    """What glyphs and fills mean, drawn with the map's own glyphs, facing up."""
+    """Draw the key of glyphs and fills with the map's own glyphs, facing up."""
     key: list[tuple[int | str, str]] = [
         (FORWARD, "moves forward"),
         (LEFT, "turns left"),
@@ -229,7 +229,7 @@ def hidden_path(
     theme: Theme = LIGHT,
     title: str = "Where the patroller may have been",
 ) -> Figure:
-    """The belief about one patroller's path: probability of each cell at each step, along the corridors.
+    """Draw the belief about one patroller's path: probability of each cell at each step, along the corridors.
 
     ``posterior[t, s] = P(s_t = s | everything seen)``, the state marginals of
     :func:`~i2rl.inference.completion.smoothing.smooth_all`; ``seen[t]`` says whether the step was seen;

@@ -1,4 +1,4 @@
-"""How figures look: two themes, one colour-blind safe palette, the look of every method, and saving.
+"""Style of figures: two themes, one colour-blind safe palette, the style of every method, and saving.
 
 Every two of the eight colours of a theme are at least 0.1 apart in OKLab, also as seen without red, green or
 blue cones (Machado, Oliveira and Fernandes 2009); markers and dashes say the same once more.
@@ -247,7 +247,7 @@ def method_styles(theme: Theme, names: Iterable[str]) -> dict[str, dict[str, Any
 
 
 def new_figure(theme: Theme, width: float, height: float) -> Figure:
-    """An empty figure of so many inches that arranges its axes without overlap."""
+    """Make an empty figure of so many inches that arranges its axes without overlap."""
     return Figure(figsize=(width, height), dpi=DPI, facecolor=theme.surface, layout="constrained")
 
 

@@ -1,4 +1,4 @@
-"""How good a learned reward is (section 7.2), and how sure the numbers are.
+"""Quality of a learned reward (section 7.2), and uncertainty of the numbers.
 
 A learned reward is judged by the behaviour it prescribes, under the expert's true reward: whether it acts
 like the expert, and what it loses. Everything is exact: no simulation, no offset, no rescaling.
@@ -48,7 +48,7 @@ class LearningError(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Everything a learned reward is judged by; ``value`` and ``best_value`` start from ``p0``."""
+    """All measures of a learned reward; ``value`` and ``best_value`` start from ``p0``."""
 
     accuracy: Accuracy
     error: LearningError
@@ -57,7 +57,8 @@ class Evaluation(NamedTuple):
 
 
 def greedy_policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """The deterministic policy that is optimal for ``weights``; ties go to the first action of the MDP.
+    """Compute the deterministic policy that is optimal for ``weights``; ties go to the first action of the
+    MDP.
 
     Actions within 1e-9 of the best, relative to the spread of the values, count as tied. Raises
     ``ValueError`` for discount 1, weights of the wrong number, or weights that are not numbers.
@@ -66,7 +67,7 @@ def greedy_policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, 
 
 
 def optimal_actions(mdp: TabularMDP, weights: Float[Array, " K"]) -> Bool[Array, "S A"]:
-    """Every action that is optimal for ``weights``; ties and errors as for :func:`greedy_policy`."""
+    """Find every action that is optimal for ``weights``; ties and errors as for :func:`greedy_policy`."""
     return _optimal(mdp, _checked(mdp, weights))
 
 
@@ -141,14 +142,14 @@ def inverse_learning_error(
 def learned_value(
     mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
 ) -> Float[Array, ""]:
-    """Expected discounted true reward ``p0 . V^pi`` of the learned greedy policy."""
+    """Compute the expected discounted true reward ``p0 . V^pi`` of the learned greedy policy."""
     return evaluate(mdp, true_weights, learned_weights).value
 
 
 def evaluate(
     mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
 ) -> Evaluation:
-    """All of the above for the cost of one of them.
+    """Compute all measures above for the cost of one of them.
 
     Maps over learned weights ``[N, K]`` with ``jax.vmap(partial(evaluate, mdp, true_weights))``. Raises
     ``ValueError`` as :func:`greedy_policy` does.

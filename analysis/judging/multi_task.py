@@ -1,4 +1,4 @@
-"""How well several ways of doing a task were told apart, and what each is worth (section 7.2).
+"""Recovery of several behaviours from mixed demonstrations, and the value of each component (section 7.2).
 
 Ways found and behaviours demonstrated are numbered independently: agreement of the two is judged up to a
 renumbering, values under the true reward of what each trajectory really was.
@@ -107,7 +107,7 @@ def assignment_accuracy(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarr
 
 
 def match_components(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> dict[int, int]:
-    """Which way is which behaviour: from behaviours to ways, one to one, with most trajectories in common.
+    """Match behaviours to components, one to one, with the most trajectories in common.
 
     A behaviour is missing where no way is left for it that has any of its trajectories. Errors as for
     :func:`assignment_accuracy`.

@@ -1,4 +1,4 @@
-"""How good a reward and a policy of networks are (section 7.4.3): returns, correlations, LBA, empirical ILE.
+"""Quality of a reward and a policy of networks (section 7.4.3): returns, correlations, LBA, empirical ILE.
 
 Where there is no table of states everything is estimated from episodes, so every number comes with the
 distribution it was taken over, its count and an interval. Shares are in [0, 1].
@@ -50,7 +50,7 @@ class Interval(NamedTuple):
 
 
 class Correlation(NamedTuple):
-    """How two numbers go together.
+    """Correlation of two numbers.
 
     Fields
     ------
@@ -175,7 +175,7 @@ def _standardised(x: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 
 def _resampled(key: Array, n: int, resamples: int) -> Int[np.ndarray, "resamples n"]:
-    """How often each of ``n`` is drawn, with replacement."""
+    """Draw the multiplicities of ``n`` items, with replacement."""
     drawn = np.asarray(jax.random.randint(key, (resamples, n), 0, n))
     return np.bincount((drawn + n * np.arange(resamples)[:, None]).ravel(), minlength=resamples * n).reshape(
         resamples, n
@@ -194,7 +194,8 @@ def _percentiles(drawn: Float[np.ndarray, " B"], coverage: float) -> Interval:
 
 
 def action_agreement(space: ActionSpace, expert: np.ndarray, learner: np.ndarray) -> Float[np.ndarray, "..."]:
-    """How alike two actions are, in [0, 1]: ``1 - |a_E - a_L| / |a_max - a_min|``, or whether they are equal.
+    """Compute the agreement of two actions, in [0, 1]: ``1 - |a_E - a_L| / |a_max - a_min|``, or their
+    equality.
 
     Vectors ``[..., k]`` are cut to their bounds first, as an environment does.
     """
@@ -305,7 +306,7 @@ class EmpiricalILE(NamedTuple):
 
 
 def empirical_ile(demonstrated: float, generated: float) -> EmpiricalILE:
-    """Both forms, from two values. NaN where what is divided by is zero."""
+    """Compute both forms from two values. NaN where the divisor is zero."""
     apart = demonstrated - generated
     return EmpiricalILE(
         demonstrated,

@@ -33,14 +33,15 @@ _METADATA = {
 
 
 def notebooks() -> list[Path]:
-    """The package's notebooks in the order in which they are to be read."""
+    """List the package's notebooks in reading order."""
     return sorted(FOLDER.glob("*.ipynb"))
 
 
 def execute_notebook(
     path: Path | str, parameters: Mapping[str, Any] | None = None, *, timeout: int = 600
 ) -> NotebookNode:
-    """The notebook with its outputs, executed by this interpreter in an empty folder; no file is written.
+    """Execute the notebook by this interpreter in an empty folder, and return it with its outputs; write no
+    file.
 
     ``parameters`` replace values set in the cell tagged ``parameters``; ``timeout`` is in seconds, of one
     cell. The user's Jupyter and IPython settings play no part. Raises ``ValueError`` for a parameter that
@@ -110,7 +111,9 @@ def _inject(notebook: NotebookNode, parameters: Mapping[str, Any], name: str) ->
 
 
 def tidy(notebook: NotebookNode) -> NotebookNode:
-    """The notebook without machine metadata, and with pictures of at most 256 colours (a third the size)."""
+    """Return the notebook without machine metadata, and with pictures of at most 256 colours (a third the
+    size).
+    """
     notebook.metadata = nbformat.from_dict(_METADATA)
     for cell in notebook.cells:
         cell.metadata = nbformat.from_dict({k: v for k, v in cell.metadata.items() if k == "tags"})

@@ -49,7 +49,7 @@ def require_posterior(
     *,
     extra: tuple[str, ...] = (),
 ) -> xr.DataArray:
-    """The weights ``(chain, draw, ..., feature)`` of a posterior, if it is one, and one of this model.
+    """Return the weights ``(chain, draw, ..., feature)``; raise unless they are a posterior of this model.
 
     ``extra`` names the dimensions that weights must have besides ``chain``, ``draw`` and ``feature``. An MDP
     or sensor is compared by the fingerprints that :func:`~i2rl.inference.posteriors.weights.sample_posterior`
@@ -256,7 +256,7 @@ def posterior_by_session(
 
 
 def _restricted(problem: Problem, rows: np.ndarray) -> Problem:
-    """The problem of some of the trajectories, by their rows, in arrays of the same shape."""
+    """Restrict the problem to some trajectories, by their rows, in arrays of the same shape."""
     repeats = np.bincount(rows, minlength=len(problem.repeats))
     absent = (repeats == 0)[:, None, None]
     # A row of padding has probability one, whatever the weights.

@@ -338,7 +338,9 @@ def completed_path(
 def completion_frequencies(
     idata: az.InferenceData, trajectories: Sequence[int], patrol: Patrol
 ) -> tuple[Float[np.ndarray, "L S"], np.ndarray]:
-    """How often each state completes each step, and whether the step was seen; rows joined one by one."""
+    """Compute how often each state completes each step, and whether the step was seen; rows joined one by
+    one.
+    """
     require_posterior(idata, patrol.mdp)
     for group, made in (
         ("completions", "sample_posterior(..., completions=True)"),

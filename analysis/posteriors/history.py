@@ -67,7 +67,7 @@ def run_history(
     seed: int | None = None,
     true_weights: Float[np.ndarray, " K"] | None = None,
 ) -> az.InferenceData:
-    """A learner's sessions as ``InferenceData``.
+    """Convert a learner's sessions to ``InferenceData``.
 
     Parameters
     ----------
@@ -112,7 +112,8 @@ def fleet_history(
     seed: int | None = None,
     true_weights: Float[np.ndarray, " K"] | None = None,
 ) -> az.InferenceData:
-    """The sessions of a fleet: as :func:`run_history`, with a leading dimension ``run``, one entry a stream.
+    """Convert the sessions of a fleet as :func:`run_history` does, with a leading dimension ``run``, one
+    entry a stream.
 
     ``infos`` are those of consecutive updates of :func:`~i2rl.inference.sessions.fleets.fleet`, ``state``
     is the fleet's last state. Raises ``ValueError`` as there, and for reports of a single learner.

@@ -1,4 +1,4 @@
-"""Which directions of weight space the demonstrations do not determine, and what they mean.
+"""Directions of weight space that the demonstrations do not determine, and their meaning.
 
 Two different things keep a reward from being learned, and are kept apart:
 
@@ -48,7 +48,7 @@ _MINOR = 0.15
 
 
 class Identifiability(NamedTuple):
-    """What a demonstration determines of the weights.
+    """Directions of the weights that a demonstration determines.
 
     Fields
     ------
@@ -97,7 +97,7 @@ class Identifiability(NamedTuple):
 def _shown(
     weights: Float[Array, " K"], mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration
 ) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
-    """Expected visits of each state, at all steps and at the steps that were seen."""
+    """Compute expected visits of each state, at all steps and at the steps that were seen."""
     evidence = evidence_of(mdp, sensor, demonstration)
     posterior = smooth_all(mdp, soft_plan(mdp, reward_of(mdp, weights)).log_policy, evidence)
     seen = jnp.asarray(demonstration.kind) == SEEN
@@ -250,7 +250,7 @@ def _cost(loss: float) -> str:
 
 
 def describe_identifiability(result: Identifiability) -> str:
-    """The findings in sentences, one direction a line."""
+    """Write the findings in sentences, one direction a line."""
     lines = [f"{d.kind}: {d.description}." for d in result.exact]
     count = len(result.features)
     head = (

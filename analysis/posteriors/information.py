@@ -30,7 +30,7 @@ from ...models.process.planning import features_to_go, reward_of, soft_plan
 
 @jax.jit
 def policy_sensitivity(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A K"]:
-    """Derivative of ``log pi_theta(a | s)`` by the weights; zero for unavailable actions."""
+    """Differentiate ``log pi_theta(a | s)`` by the weights; zero for unavailable actions."""
     policy = soft_plan(mdp, reward_of(mdp, weights)).policy
     to_go = features_to_go(mdp, policy)
     next_to_go = jax.vmap(mdp.expect_next, in_axes=1, out_axes=2)(to_go)

@@ -173,7 +173,7 @@ def _pivots(vectors: Float[np.ndarray, "K m"]) -> list[int]:
 
 
 def combination(features: Sequence[str], vector: Float[np.ndarray, " K"], least: float = 0.0) -> str:
-    """A direction in words, such as ``\\`moves\\` + 0.5 \\`turns\\```, its largest coefficient scaled to one.
+    """Write a direction in words, such as ``\\`moves\\` + 0.5 \\`turns\\```, scaled to one at most.
 
     Coefficients that are zero or below ``least`` times the largest are left out.
     """
@@ -231,12 +231,12 @@ def _named(
 
 @jax.jit
 def _features_to_go(mdp: TabularMDP) -> Float[Array, "S K"]:
-    """Expected discounted features under zero weights: their values, in the units of the weights."""
+    """Compute expected discounted features under zero weights: their values, in the units of the weights."""
     return features_to_go(mdp, soft_plan(mdp, jnp.zeros(mdp.available.shape)).policy)
 
 
 def _potential(mdp: TabularMDP, vector: Float[np.ndarray, " K"]) -> str:
-    """The potential that a shaping direction rewards the changes of."""
+    """Find the potential whose changes a shaping direction rewards."""
     scaled = vector / vector[np.argmax(np.abs(vector) > (1 - 1e-9) * np.abs(vector).max())]
     reachable = reachable_states(mdp)
     potential = np.asarray(_features_to_go(mdp)) @ scaled

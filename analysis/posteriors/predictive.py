@@ -1,4 +1,4 @@
-"""What a posterior predicts of the visits that were seen, against those that were."""
+"""Posterior predictive checks of the visits that were seen."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _replicate(
     sensor: AnySensor,
     counted: Bool[Array, "n L"],
 ) -> tuple[Float[Array, "D S"], Float[Array, "D S"]]:
-    """Simulated and exactly expected counts of the steps seen in each state, for every draw."""
+    """Simulate the steps seen in each state, and compute their exact expectation, for every draw."""
     n, length = counted.shape
 
     def one(inputs: tuple) -> tuple:
@@ -130,7 +130,9 @@ def _replicate(
 def _expected_visits(
     mdp: TabularMDP, policy: Float[Array, "S A"], sensor: AnySensor, steps: Array
 ) -> Float[Array, " S"]:
-    """Expected number of steps seen in each state, ``steps [L]`` being how many are counted at each time."""
+    """Compute the expected number of steps seen in each state; ``steps [L]`` counts the trajectories at each
+    time.
+    """
     pairs = finite_occupancy(mdp, jnp.broadcast_to(policy, (len(steps), *policy.shape)))
     total = jnp.einsum("t,tsa->sa", steps, pairs)
     if sensor.visibility is not None:

@@ -1,4 +1,4 @@
-"""Which features does the expert care about? Feature sets compared by leave-one-out cross-validation.
+"""Selection of features: feature sets compared by leave-one-out cross-validation.
 
 Each set gives a posterior; the sets are ranked by how well they predict a trajectory from all the others
 (expected log predictive density, PSIS-LOO of Vehtari, Gelman and Gabry 2017, by ArviZ). The unit left out is
@@ -61,7 +61,7 @@ class FeatureComparison(NamedTuple):
 def with_features(
     mdp: TabularMDP, features: Float[np.ndarray, "S A K"], names: Sequence[str] | None = None
 ) -> TabularMDP:
-    """The same process with other features ``[S, A, K]``, by other names.
+    """Return the same process with other features ``[S, A, K]``, by other names.
 
     Raises ``ValueError`` for features of another shape or not finite where an action is available, and for
     names of the wrong number or repeated.
@@ -80,7 +80,7 @@ def with_features(
 
 
 def select_features(mdp: TabularMDP, names: Sequence[str]) -> TabularMDP:
-    """The same process with only the features of these names, in this order.
+    """Return the same process with only the features of these names, in this order.
 
     Raises ``ValueError`` naming an unknown or repeated feature, or for no names at all.
     """

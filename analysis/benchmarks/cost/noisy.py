@@ -61,7 +61,7 @@ WARM = 3
 
 
 class Stream(NamedTuple):
-    """What a learner is timed on: a process, predicates ``[J, S, A]``, and sessions of ``trajectories``."""
+    """Task of a timed learner: a process, predicates ``[J, S, A]``, and sessions of ``trajectories``."""
 
     mdp: TabularMDP
     predicates: Int[np.ndarray, "J S A"]
@@ -93,7 +93,8 @@ def stream_of(task: NoisyTask, sessions: int, trajectories: int = 2, steps: int 
 
 
 def random_stream(size: int, predicates: int, sessions: int, *, named: bool = False, seed: int = 0) -> Stream:
-    """A grid of ``size x size`` cells, predicates of its pairs drawn by coin, and reports with scores.
+    """Simulate a grid of ``size x size`` cells, predicates of its pairs drawn by coin, observations with
+    scores.
 
     With ``named``, state and action are known by two labels besides, so that no two pairs are one class. A
     tenth of the reports are of any pair; the expert is soft.

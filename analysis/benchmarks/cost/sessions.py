@@ -127,7 +127,7 @@ def online_against_batch(sessions: int, replications: int, rerun_points: int = 1
 
 
 def ring(n_states: int, n_actions: int = 4, n_features: int = 6, seed: int = 0) -> TabularMDP:
-    """A random MDP of local moves on a ring, three successors a pair, binary features."""
+    """Build a random MDP of local moves on a ring, three successors a pair, binary features."""
     rng = np.random.default_rng(seed)
     offsets = np.stack([np.full((n_states, n_actions), d) for d in (-1, 0, 1)], -1)
     successors = (np.arange(n_states)[:, None, None] + offsets) % n_states

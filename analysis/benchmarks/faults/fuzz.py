@@ -58,7 +58,7 @@ LIMIT = 2**22
 
 
 class Tally(NamedTuple):
-    """What became of inputs.
+    """Outcomes of inputs.
 
     Fields
     ------
@@ -149,7 +149,7 @@ _STEPS = {
 
 
 def composed_trajectory(draws: random.Random) -> str:
-    """A line of a trajectory, valid but for a value now and then."""
+    """Compose a line of a trajectory, valid but for a value now and then."""
     pick, chance = draws.choice, draws.random
 
     def value(valid: Sequence[str]) -> str:
@@ -169,7 +169,7 @@ def composed_trajectory(draws: random.Random) -> str:
 
 
 def composed_bout(draws: random.Random) -> str:
-    """A line of a walk in the labyrinth, valid but for a node or a frame now and then."""
+    """Compose a line of a walk in the labyrinth, valid but for a node or a frame now and then."""
     pick, chance = draws.choice, draws.random
     nodes = [0]
     for _ in range(1 + draws.randrange(8)):
@@ -184,7 +184,7 @@ def composed_bout(draws: random.Random) -> str:
 
 
 def composed_row(draws: random.Random) -> str:
-    """A row of a recording of onions, valid but for a cell now and then."""
+    """Compose a row of a recording of onions, valid but for a cell now and then."""
     cells = [draws.choice(("0.00", "0", "-0.0", "1e-3", " 0 ")) for _ in range(SIZE)]
     if draws.random() < 0.5:
         cells[draws.randrange(SIZE)] = draws.choice(_VALUES)
@@ -313,7 +313,7 @@ def largest_lines(limits: LineLimits = DEFAULT_LIMITS) -> dict[str, int]:
 
 
 def plain_archive(**options: Any) -> bytes:
-    """A valid archive of a small process with names and a view."""
+    """Make a valid archive of a small process with names and a view."""
     mdp = TabularMDP.from_successors(
         np.array([[[0, 1], [1, 2]]] * 3),
         np.full((3, 2, 2), 0.5),
@@ -328,7 +328,7 @@ def plain_archive(**options: Any) -> bytes:
 
 
 def mutated_archives(seed: int, n: int) -> Iterator[bytes]:
-    """Valid archives with bytes flipped, deleted, repeated or cut off; some of them have right checksums."""
+    """Flip, delete, repeat or cut off bytes of valid archives; some of them have right checksums."""
     draws = random.Random(seed)
     base = plain_archive()
     arrays = _entries(base)
@@ -396,7 +396,7 @@ class _Raw(NamedTuple):
 
 
 def _raw_archive(entries: Sequence[_Raw], repeated: int = 1) -> bytes:
-    """An archive of entries as they are, its list ``repeated``."""
+    """Write an archive of entries as they are, its list ``repeated``."""
     body, listed = bytearray(), bytearray()
     for entry in entries:
         fields = (entry.method, 0, 0, entry.crc, len(entry.content), entry.size, len(entry.name), 0)
@@ -410,7 +410,7 @@ def _raw_archive(entries: Sequence[_Raw], repeated: int = 1) -> bytes:
 
 
 def _bomb(name: str, head: bytes, megabytes: int, others: dict[str, bytes], size: int | None = None) -> bytes:
-    """An archive with an array that inflates to so many zeros behind its head, and says to have ``size``."""
+    """Write an archive with an array that inflates to so many zeros behind its head, and claims ``size``."""
     squeeze = zlib.compressobj(9, zlib.DEFLATED, -15)
     first = squeeze.compress(head) + squeeze.flush(zlib.Z_FULL_FLUSH)
     # After a full flush blocks depend on nothing before them, and can be repeated.
@@ -612,7 +612,7 @@ def crafted_archives() -> dict[str, bytes]:
 
 
 def _patched(content: bytes, offset: int, value: int) -> bytes:
-    """The 16-bit field at ``offset`` in every local header, and in every entry of the list, set."""
+    """Set the 16-bit field at ``offset`` in every local header, and in every entry of the list."""
     patched = bytearray(content)
     for signature, extra in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):
         at = content.find(signature)

@@ -79,12 +79,12 @@ class Counter:
     name, signature, mdp, configuration = "counter", "s" * 64, _Anywhere(), {"size": 1500}
 
     def init(self, key: Any) -> CounterState:
-        """The state before the first session."""
+        """Return the state before the first session."""
         del key
         return self.after(0)
 
     def after(self, session: int) -> CounterState:
-        """The state after so many sessions."""
+        """Return the state after so many sessions."""
         return CounterState(np.arange(2.0) * session, np.arange(1500.0) + session, session)
 
 
@@ -102,12 +102,12 @@ def learn(path: Path, sessions: int, committed: Callable[[int], object] = lambda
 
 
 def told(content: Content) -> list[tuple]:
-    """What a journal holds, without the clock."""
+    """Return a journal's content without the clock."""
     return [*content.sessions, *content.state]
 
 
 class Left(NamedTuple):
-    """What was done to a journal, the file that this left, and the sessions that were committed by then."""
+    """Damage of a journal, the file that it left, and the sessions that were committed by then."""
 
     case: str
     path: Path
@@ -116,7 +116,7 @@ class Left(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What was done to a journal, what became of it, and what was wrong with that (nothing if empty)."""
+    """Damage of a journal, the result, and its fault (empty if there is none)."""
 
     case: str
     result: str
@@ -185,7 +185,7 @@ class _Tally:
         os.write(self._writing, b".")
 
     def total(self) -> int:
-        """The count; only once."""
+        """Return the count; only once."""
         os.close(self._writing)
         with open(self._reading, "rb") as pipe:
             return len(pipe.read())
@@ -351,7 +351,7 @@ def damaged(folder: Path, count: int = 2000, seed: int = 0, sessions: int = 20) 
 
 
 def _judged(path: Path, end: Content, sessions: int) -> tuple[str, str]:
-    """What becomes of a damaged journal that is looked at and learned on in, and what is wrong with that."""
+    """Read a damaged journal, learn on in it, and return the result and its fault."""
     shown = learned = "right"
     try:
         if content(path).sessions != end.sessions[:sessions]:

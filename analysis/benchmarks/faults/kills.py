@@ -53,7 +53,7 @@ ATTEMPTS = 4
 
 
 class Instant(NamedTuple):
-    """When to kill: ``seconds`` after the start, or ``delay`` after as many reports."""
+    """Instant of a kill: ``seconds`` after the start, or ``delay`` after as many lines of output."""
 
     seconds: float
     reports: float
@@ -61,7 +61,7 @@ class Instant(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """How a process ended: whether it was killed, its reports until then, and what it took in seconds.
+    """End of a process: whether it was killed, its lines of output until then, and its seconds.
 
     ``first`` and ``last`` are the times of its first and last report, NaN if there was none.
     """
@@ -89,7 +89,7 @@ class Kill(NamedTuple):
 
 
 class Survival(NamedTuple):
-    """What became of a stream that was learned under kills.
+    """Outcome of a stream that was learned under kills.
 
     Fields
     ------
@@ -119,7 +119,7 @@ NEVER = Instant(np.inf, np.inf, 0.0)
 
 
 def content(path: Path) -> Content:
-    """Everything in a journal but the clock's readings, in bytes."""
+    """Return everything in a journal but the clock's times, in bytes."""
     with Journal.read(path) as view:
         sessions = [
             (
@@ -213,7 +213,7 @@ class Forks:
         )
 
     def start(self, arguments: Sequence[str], cached: bool) -> Started:
-        """As :data:`Start` says; one at a time."""
+        """Start as :data:`Start` says; one process at a time."""
         pipe = self._folder / "pipe"
         pipe.unlink(missing_ok=True)
         os.mkfifo(pipe)
@@ -413,7 +413,7 @@ def _survive(
 
 
 def _copied(journal: Path, folder: Path) -> Content:
-    """What is on disk, read from a copy, so that the next process itself meets what the kill left."""
+    """Read the files on disk from a copy, so that the next process itself meets the state after the kill."""
     copy = folder / "copy.db"
     for suffix in ("", "-wal", "-shm", "-journal"):
         copy.with_name(copy.name + suffix).unlink(missing_ok=True)
@@ -426,7 +426,7 @@ def _copied(journal: Path, folder: Path) -> Content:
 
 
 def _begun(path: Path) -> bool:
-    """Whether the journal's tables are there: the process may have been killed before it had made them."""
+    """Test whether the journal's tables exist: the kill may have come before they were made."""
     connection = sqlite3.connect(path)
     try:
         return bool(connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0])

@@ -1,4 +1,4 @@
-"""What is learned does not depend on the units of the features.
+"""Independence of learning from the units of the features.
 
 Run as ``python -m i2rl.analysis.benchmarks.faults.units``.
 
@@ -77,19 +77,19 @@ def process() -> TabularMDP:
 
 
 def in_units(units: Float[np.ndarray, " K"]) -> TabularMDP:
-    """The same process, each feature times a factor."""
+    """Return the same process, each feature times a factor."""
     return replace(process(), features=process().features * units)
 
 
 @jax.jit
 def policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """The soft policy of weights."""
+    """Compute the soft policy of weights."""
     return soft_plan(mdp, reward_of(mdp, weights)).policy
 
 
 @jax.jit
 def greedy_policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """The Boltzmann policy of weights."""
+    """Compute the Boltzmann policy of weights."""
     return jnp.exp(boltzmann_log_policy(mdp, weights))
 
 
@@ -102,7 +102,7 @@ def demonstration(sensor: str = "clear") -> Demonstration:
 
 
 def target(mdp: TabularMDP) -> FeatureTarget:
-    """What the expert's policy collects."""
+    """Compute the features that the expert's policy collects."""
     expert = policy(mdp, jnp.asarray(TRUTH / feature_scale(mdp)))
     return FeatureTarget(feature_expectations(mdp, expert), mdp.initial)
 
@@ -199,13 +199,13 @@ def units_of(name: str, number: int, seed: int = 0) -> Float[np.ndarray, "number
 
 
 def policies(mdp: TabularMDP, weights: Array | np.ndarray, name: str = "") -> Float[np.ndarray, "D S A"]:
-    """The policy of each row of weights, as the method understands its experts."""
+    """Compute the policy of each row of weights under the method's model of experts."""
     of = greedy_policy if name in GREEDY else policy
     return np.stack([of(mdp, jnp.asarray(row)) for row in np.asarray(weights).reshape(-1, 3)])
 
 
 class Difference(NamedTuple):
-    """What units changed: the largest difference of a policy, and of a weight relative to the largest."""
+    """Effect of units: the largest difference of a policy, and of a weight relative to the largest."""
 
     policy: float
     weight: float

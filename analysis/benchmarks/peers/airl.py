@@ -169,7 +169,7 @@ def _hopper() -> tuple[PPO, Episodes]:
 
 
 def _cart_pole() -> tuple[PPO, Episodes]:
-    """The demonstrator is our PPO's policy after 60,000 steps by the true reward."""
+    """Train the demonstrator: our PPO's policy after 60,000 steps by the true reward."""
     settings = {"n_envs": CART_POLE.n_envs, "n_steps": CART_POLE.n_steps, "learning_rate": 1e-3}
     agent = ppo(cart_pole(), scale_rewards=True, **settings)
     state, _ = agent.train(agent.init(jax.random.key(0)), 60_000)

@@ -55,7 +55,7 @@ _ONE_THREAD = {
 
 
 def random_problem(n_states: int, seed: int, tolerance: float) -> dict[str, np.ndarray]:
-    """A random process and the exact visits of the soft expert of a standard-normal state reward."""
+    """Draw a random process and the exact visits of the soft expert of a standard-normal state reward."""
     rng = np.random.default_rng(seed)
     rows = n_states * N_ACTIONS
     successors = np.array([rng.choice(n_states, WIDTH, replace=False) for _ in range(rows)])

@@ -75,7 +75,7 @@ class Trainer(Side):
     """A contestant that trains an agent for each request."""
 
     def train(self, request: dict[str, Any]) -> dict[str, float]:
-        """Returns and seconds of one agent."""
+        """Train one agent; return its returns and seconds."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
@@ -143,7 +143,7 @@ def difference(ours: list[float], peers: list[float]) -> tuple[float, float]:
 
 
 def compare(ours: Trainer, peer: Trainer, name: str, seeds: int) -> dict[str, Any]:
-    """Both sides on one task, in turn."""
+    """Run both sides on one task, in turn."""
     task = TASKS[name]
     runs: dict[str, list[dict[str, float]]] = {"ours": [], "peer": []}
     for seed in range(seeds):

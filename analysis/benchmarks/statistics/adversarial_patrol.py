@@ -98,7 +98,7 @@ class _File:
 
 
 def _timed(patrol: Patrol, learner: Learner, streams: Demonstration) -> tuple[Outcome, float]:
-    """All streams of a learner, and the seconds they took, compilation included."""
+    """Run all streams of a learner; return the seconds they took, compilation included."""
     found: list[Outcome] = []
     took = seconds(lambda: found.append(outcome_of(patrol, learner, streams)))
     return found[0], took
@@ -131,7 +131,8 @@ def noise_study(
     levels: Sequence[float],
     iterations: int,
 ) -> None:
-    """Every method at the first level; at the others, on ``few`` replications, what shows the cost of noise.
+    """Run every method at the first level; at the others, on ``few`` replications, the methods that show the
+    cost of noise.
 
     AIRL learners with and without memory of earlier sessions.
     """

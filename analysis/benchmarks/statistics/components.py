@@ -1,4 +1,4 @@
-"""Several ways of doing a task: online against batch, a way that comes late, hidden steps, experts who err.
+"""Several behaviours of a task: online against batch, a late component, hidden steps, experts who err.
 
 ``python -m i2rl.analysis.benchmarks.statistics.n_components`` measures MME-MTIRL on onion sorting (26 states,
 ``D = 4``):
@@ -44,7 +44,7 @@ STEPS = 50
 
 
 def shuffled(key: jax.Array, mixed: MixedDemonstration) -> MixedDemonstration:
-    """The same trajectories in a random order."""
+    """Return the same trajectories in a random order."""
     order = np.asarray(jax.random.permutation(key, len(mixed.labels)))
     return MixedDemonstration(mixed.demonstration.select(order), mixed.labels[order])
 

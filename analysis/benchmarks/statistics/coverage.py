@@ -40,7 +40,7 @@ from ..harness import print_table, publish
 
 
 def random_setting(seed: int = 0, n_states: int = 12, n_actions: int = 3, n_features: int = 4) -> Setting:
-    """A random MDP of which a third is in view, its expert's weights uniform in [0, 1]."""
+    """Draw a random MDP with a third of its states in view, its expert's weights uniform in [0, 1]."""
     rng = np.random.default_rng(seed)
     successors = np.argsort(rng.random((n_states, n_actions, n_states)), axis=2)[:, :, :3]
     mdp = TabularMDP.from_successors(
@@ -82,7 +82,7 @@ def sample_sizes(setting: Setting, confidence: float = 0.8) -> pd.DataFrame:
 
 
 def planned_coverage(key: jax.Array, setting: Setting, table: pd.DataFrame, replications: int) -> list[dict]:
-    """Whether the observed bound, at the sizes planned for it, is what was planned, and covers."""
+    """Test whether the observed bound, at the sizes planned for it, has the planned error, and covers."""
     mdp, discount = setting.mdp, float(setting.mdp.discount)
     expert, found = expert_of(mdp, setting.weights), []
     for i, row in enumerate(table.itertuples()):

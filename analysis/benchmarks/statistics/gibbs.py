@@ -135,7 +135,7 @@ def particle_smoother(
 
 
 def by_particles(key: Array, process: float, variance: float, reported: Recording, options: Any) -> Moments:
-    """The referee's moments."""
+    """Compute the referee's moments."""
     drawn = np.asarray(
         particle_smoother(key, POLICY, process, variance, reported, options.particles, options.backward)
     )

@@ -100,7 +100,7 @@ class Drawn(NamedTuple):
 
 
 def small_mixture(trajectories: int, length: int, components: int = 8) -> Setting:
-    """The world that one way is calibrated in, two of its five states out of view."""
+    """Build the process of the calibration with one component, two of its five states out of view."""
     world = calibration.small_world()
     return Setting(
         world.mdp,
@@ -215,7 +215,7 @@ def agreement(
 
 
 def invariant_statistics(drawn: Drawn, feature_names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """What is ranked, ``[...]``: nothing that depends on what the ways are called."""
+    """Compute the ranked statistics, ``[...]``; they are invariant to the order of the components."""
     counts = (drawn.assignment[..., None] == np.arange(drawn.proportions.shape[-1])).sum(-2)
     first = np.take_along_axis(drawn.weights, drawn.assignment[..., :1, None], axis=-2)[..., 0, :]
     ranked = {
@@ -293,7 +293,7 @@ def rank_statistics(
 
 
 def tails(compared: list[Comparison]) -> dict[str, Any]:
-    """The largest ``|z|`` and how many exceed 2 and 3, with what agreement would lead one to expect.
+    """Count ``|z|`` above 2 and 3, with their expectations under agreement, and find the largest.
 
     Moments of one posterior are correlated, so that counts vary more than those of independent ones; the
     chance of so large a ``|z|`` among as many independent ones is then an upper bound.

@@ -1,4 +1,4 @@
-"""How often intervals of the joint posterior over weights and reliabilities cover the truth.
+"""Coverage of intervals of the joint posterior over weights and reliabilities.
 
 ``python -m i2rl.analysis.benchmarks.statistics.noisy_coverage`` draws weights and reliabilities from the
 model's own prior, lets a soft expert of those weights be reported through :class:`FeatureNoise` of those
@@ -48,7 +48,7 @@ MIXED = 1.05
 
 
 class NoisySetting(NamedTuple):
-    """What is replicated: a task, its predicates and priors, ``trajectories`` of ``length`` steps."""
+    """Replicated setting: a task, its predicates and priors, ``trajectories`` of ``length`` steps."""
 
     name: str
     mdp: TabularMDP
@@ -67,7 +67,7 @@ class NoisySetting(NamedTuple):
 
 
 class Sampling(NamedTuple):
-    """How every posterior is sampled; ``draws`` are kept of each of ``chains``."""
+    """Settings of every posterior's sampler; it retains ``draws`` of each of ``chains``."""
 
     chains: int = 2
     warmup: int = 300
@@ -95,7 +95,7 @@ class Run(NamedTuple):
 
 
 class CoverageStudy(NamedTuple):
-    """All replications.
+    """Results of all replications.
 
     Fields
     ------
@@ -274,7 +274,7 @@ def _densities(
 def covers(
     draws: Float[np.ndarray, "D Q"], truth: Float[np.ndarray, " Q"], probability: float = PROBABILITY
 ) -> Bool[np.ndarray, " Q"]:
-    """Whether each truth lies in the central interval of its draws.
+    """Test whether each truth lies in the central interval of its draws.
 
     Raises ``ValueError`` for a probability outside (0, 1).
     """
@@ -331,7 +331,7 @@ def coverage_interval(covered: Bool[np.ndarray, " R"]) -> tuple[float, float]:
 
 
 def report(study: CoverageStudy, bins: int = 16) -> dict[str, Any]:
-    """What the study found, as numbers that go to JSON.
+    """Return the study's results as numbers for JSON.
 
     ``overall``: the share of all intervals, over replications and quantities, that cover; its error is that
     of a mean over replications, as quantities of one run go together. ``ranks p``: chi-square test over

@@ -72,7 +72,7 @@ class Threshold(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """What is watched, who learns from it, and with which thresholds."""
+    """Observed task, its learner, and its thresholds."""
 
     title: str
     demonstrations: Demonstration
@@ -110,7 +110,7 @@ def _thresholds(constant: float, beta: float, scales: tuple[float, ...], session
 def settings(
     patrol: Patrol, key: Array, replications: int, sessions: int
 ) -> dict[str, Callable[[], Setting]]:
-    """The four settings by name; each is simulated when called."""
+    """Return the four settings by name; each is simulated when called."""
     mdp, view = patrol.mdp, patrol.visibility(PERCENT)
     plan = soft_plan(mdp, reward_of(mdp, jnp.asarray(patrol.weights)))
     expert = jnp.asarray(patrol.expert_policy())
@@ -167,7 +167,7 @@ def settings(
 
 
 def measure(patrol: Patrol, setting: Setting, key: Array) -> dict[str, Gaps]:
-    """Every threshold on the same streams."""
+    """Measure every threshold on the same streams."""
     return {
         t.name: regret_gaps(
             setting.learner(t.slack),

@@ -1,4 +1,4 @@
-"""Does leave-one-out cross-validation pick the features that the expert cares about?
+"""Selection of the expert's features by leave-one-out cross-validation.
 
 ``python -m i2rl.analysis.benchmarks.statistics.selection`` compares four feature sets on patrol 2, from
 fragments of five steps at 30 % observability, for two experts: the domain's patrollers, who never err, and
@@ -41,7 +41,7 @@ EXPERTS = ("greedy", "soft")
 
 
 def feature_sets(patrol: Patrol) -> dict[str, TabularMDP]:
-    """The four sets."""
+    """Return the four sets."""
     mdp, names = patrol.mdp, patrol.mdp.feature_names
     turning = np.zeros((mdp.n_states, mdp.n_actions, 1))
     turning[:, [LEFT, RIGHT]] = 1
@@ -57,7 +57,7 @@ def feature_sets(patrol: Patrol) -> dict[str, TabularMDP]:
 
 
 def shown(expert: str, seed: int, patrol: Patrol, fragments: int) -> Demonstration:
-    """What is seen of one of the two experts."""
+    """Simulate the observation of one of the two experts."""
     key = jax.random.key(seed)
     if expert == "greedy":
         return demonstrate(key, patrol, OBSERVABILITY, fragments)[0]

@@ -59,7 +59,7 @@ SHARES = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5])
 
 
 def learn(patrol: Patrol, replications: int, sessions: int, seed: int) -> dict[str, np.ndarray]:
-    """Reports of all streams: log-likelihoods and gradients ``[R, T]``, weights ``[R, T, K]``."""
+    """Learn all streams: log-likelihoods and gradients ``[R, T]``, weights ``[R, T, K]``."""
     key, start = jax.random.key(seed), jax.random.key(seed + 1)
     rows = [demonstrate(k, patrol, PERCENT, sessions, STEPS)[0] for k in jax.random.split(key, replications)]
     streams = Demonstration(*(np.stack(parts)[:, :, None] for parts in zip(*rows, strict=True)))
@@ -70,7 +70,7 @@ def learn(patrol: Patrol, replications: int, sessions: int, seed: int) -> dict[s
 
 
 def histories(patrol: Patrol, reports: dict[str, np.ndarray]) -> Histories:
-    """The reports, with the behaviour learned by each session and how good it is."""
+    """Return the infos of all sessions, with each session's learned behaviour and its accuracy."""
     mdp, true = patrol.mdp, jnp.asarray(patrol.weights)
     weights = reports["weights"]
     shape = weights.shape[:2]
@@ -92,7 +92,7 @@ def histories(patrol: Patrol, reports: dict[str, np.ndarray]) -> Histories:
 
 
 def sweeps(h: Histories, margin: float) -> dict[str, Sweep]:
-    """Every rule over its tolerances."""
+    """Apply every rule over its tolerances."""
     replications, sessions = h.accuracy.shape
     scale = float(h.error.max())
 
@@ -156,7 +156,7 @@ def _told(v: Verdict) -> dict[str, Any]:
 
 
 def _ratios(single: Sweep, window: Sweep) -> dict[str, float]:
-    """False stops of the single step per false stop of the window, at each tolerance; at least 1 counted."""
+    """Divide false stops of the single step by those of the window, at each tolerance; at least 1 counted."""
     pairs = zip(window.rho, single.verdicts, window.verdicts, strict=True)
     return {f"{rho:.2g}": a.false_stops / max(b.false_stops, 1) for rho, a, b in pairs}
 

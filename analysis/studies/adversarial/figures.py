@@ -104,7 +104,7 @@ def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
 
 
 def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure:
-    """How much of what noise cost each domain robust-AIRL wins back, beside the dissertation's share."""
+    """Draw robust-AIRL's recovery of each domain's loss to noise, beside the dissertation's share."""
     rows = [
         (result, method, found)
         for result in results
@@ -390,7 +390,7 @@ def cells_plot(
 
 
 def frames_plot(strips: Sequence[FrameStrip], theme: Theme, title: str = "") -> Figure:
-    """A row of moments for each episode, seen from the side; time and distance under each."""
+    """Draw a row of moments for each episode, seen from the side; time and distance under each."""
     moments = max(len(s.seconds) for s in strips)
     shapes = [_outlines(s) for s in strips]
     width = 1.08 * max(float(np.ptp(s[..., 0], axis=(1, 2)).max()) for s in shapes)

@@ -100,7 +100,7 @@ def learning_table(results: AdversarialResults) -> Table:
 
 
 def recovery_table(results: AdversarialResults) -> Table:
-    """What noise costs and what is won back, as the dissertation computes both."""
+    """Tabulate the loss to noise and its recovery, as the dissertation computes both."""
     measure = figures.MEASURED[results.measure]
     clean, noisy = (results.late(name, results.measure) for name in (CLEAN, NOISY))
     rows: list[tuple[str, str, str]] = []
@@ -227,7 +227,7 @@ def _late(replications: Float[np.ndarray, " replications"] | None, measure: str)
 
 
 def _digits(returns: Any) -> int:
-    """A robot's returns are thousands, those of sorting a few."""
+    """Choose the digits of a return: a robot's returns are thousands, those of sorting a few."""
     return 0 if np.abs(returns).max() >= 100 else 2
 
 
@@ -310,7 +310,7 @@ def print_tables(results: AdversarialResults, console: Console) -> None:
 
 
 def summary(results: AdversarialResults) -> dict[str, Any]:
-    """Settings and all measures as plain data, seeds apart."""
+    """Return settings and all measures as plain data, one entry a replication."""
     return {
         "domain": results.domain,
         "noise": results.noise,

@@ -66,14 +66,14 @@ class Streams(NamedTuple):
 
 
 def confusions_of(patrol: Patrol, forward_as_left: float, right_as_forward: float) -> Confusions:
-    """The two confusions of section 7.4.3."""
+    """Return the two confusions of section 7.4.3."""
     kinds = [(FORWARD, LEFT), (RIGHT, FORWARD)]
     chances = np.array([forward_as_left, right_as_forward])
     return Confusions.of_actions(patrol.mdp.n_states, kinds, chances, patrol.mdp.n_actions)
 
 
 def noisy_streams(patrol: Patrol, level: float, replications: int, sessions: int, seed: int = 0) -> Streams:
-    """Reports of the patroller's greedy expert; the truth is the same at every level."""
+    """Simulate observations of the patroller's greedy expert; the truth is the same at every level."""
     confusions = confusions_of(patrol, level, level)
     sensor = Sensor(None, confusions.noise)
     log_policy = jnp.log(jnp.asarray(patrol.expert_policy()))
@@ -107,7 +107,7 @@ def noisy_streams(patrol: Patrol, level: float, replications: int, sessions: int
 
 
 def noise_learners(patrol: Patrol, sensor: Sensor) -> dict[str, Callable[..., Learner]]:
-    """What makes the learner of each method, given options; only AIRL on clean input is to see the truth."""
+    """Return each method's factory of learners, given options; only AIRL on clean input sees the truth."""
     mdp = patrol.mdp
     return {
         CLEAN: partial(airl_tabular, mdp),
@@ -118,7 +118,7 @@ def noise_learners(patrol: Patrol, sensor: Sensor) -> dict[str, Callable[..., Le
 
 
 def greedy_policy_of(mdp: TabularMDP, state: Any) -> Float[Array, "S A"]:
-    """The likeliest actions of what a learner has learned, adversarial or with weights of features."""
+    """Compute the likeliest actions of a learned policy, adversarial or with weights of features."""
     if hasattr(state, "log_policy"):
         return jax.nn.one_hot(jnp.argmax(state.log_policy, axis=1), mdp.n_actions)
     return deterministic_policy(hard_plan(mdp, reward_of(mdp, state.weights)).optimal)
@@ -295,7 +295,7 @@ def _run(patrol: Patrol, learner: Learner, sessions: Demonstration, seed: int) -
 
 
 def believed_trajectories(results: AdversarialResults) -> Sequence[tuple[Strip, TabularMDP]]:
-    """A new trajectory as robust-AIRL of the first seed understands it in the end; it has a misreport.
+    """Complete a new trajectory with an error by robust-AIRL of the first replication, after learning.
 
     None if no report errs in 64 sessions.
     """

@@ -82,7 +82,7 @@ def noise_curves(results: Results, theme: Theme, level: float = 0.05) -> Figure:
 
 
 def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
-    """What noise costs: LBA of the last sessions by its level, and breaches that succeed at one level.
+    """Draw the cost of noise: LBA of the last sessions by its level, and successful breaches at one level.
 
     Grey bars are the dissertation's ranges of success.
     """
@@ -206,7 +206,7 @@ def view_curves(results: Results, theme: Theme, gail_memory: float = 0.0) -> Fig
 
 
 def write_figures(results: Results, folder: Path | str) -> list[Path]:
-    """All figures whose results are there, in both themes."""
+    """Write all figures that have results, in both themes."""
     written: list[Path] = []
     if results.get("noise"):
         written += save_themes(lambda theme: noise_curves(results, theme), folder, "patrol-noise")

@@ -1,4 +1,4 @@
-"""What a study of adversarial learners comes to, as plain arrays, of which figures and tables are made.
+"""Results of a study of adversarial learners, as plain arrays for figures and tables.
 
 How to fill it: one :class:`AdversarialResults` a domain; one :class:`MethodResult` a method, under its name
 from :data:`METHODS`, with one row a seed and one column a session. Seed ``i`` is the same for all methods.
@@ -182,11 +182,11 @@ class AdversarialResults(NamedTuple):
 
     @property
     def measure(self) -> str:
-        """What noise is said to cost: ``"accuracy"`` (LBA) of few actions, ``"returns"`` of vectors."""
+        """Measure of the cost of noise: ``"accuracy"`` (LBA) of few actions, ``"returns"`` of vectors."""
         return "accuracy" if self.domain in ("patrol", "mountain-car") else "returns"
 
     def late(self, method: str, measure: str) -> Float[np.ndarray, " replications"] | None:
-        """A method's measure averaged over the last quarter of its sessions, None where there is none."""
+        """Average a method's measure over the last quarter of its sessions; None if it has none."""
         result = self.methods.get(method)
         replications = None if result is None else getattr(result, measure)
         return (
@@ -231,7 +231,7 @@ def belief_from_draws(
     draws: Float[np.ndarray, "M L m"],
     coverage: float = 0.9,
 ) -> Belief:
-    """What ``M`` posterior draws of one trajectory's components say. ``ValueError`` for unlike shapes."""
+    """Summarise ``M`` posterior draws of one trajectory's components. ``ValueError`` for unlike shapes."""
     shape = (len(truth), len(names))
     if not np.shape(reported) == np.shape(truth) == np.shape(draws)[1:] == shape:
         raise ValueError(
@@ -304,7 +304,7 @@ def read_plain(path: Path | str) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """As JSON, which has no arrays, named tuples, or numbers that are not finite."""
+    """Convert to JSON, which has no arrays, named tuples, or numbers that are not finite."""
     if type(value).__name__ in _KINDS:
         return {"kind": type(value).__name__, **{k: plain(v) for k, v in value._asdict().items()}}
     if isinstance(value, Mapping):
@@ -322,7 +322,7 @@ def plain(value: Any) -> Any:
 
 
 def rebuilt(value: Any) -> Any:
-    """What :func:`plain` was given; lists come back as tuples, all arrays as NumPy's."""
+    """Invert :func:`plain`; lists come back as tuples, all arrays as NumPy's."""
     if isinstance(value, list):
         return tuple(rebuilt(x) for x in value)
     if not isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""What ``i2rl run robust-airl`` does: the study of one task at one level of noise, and its report."""
+"""Study of one task at one level of noise, and its page: the command ``i2rl run robust-airl``."""
 
 from __future__ import annotations
 
@@ -25,8 +25,9 @@ def answer(
     cache: Path | None = None,
     advance: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> AdversarialResults:
-    """The study of a task with ``noise`` times its own noise. Raises ``ValueError`` for noise of zero, and
-    for a domain that is not studied.
+    """Study a task with ``noise`` times its own noise.
+
+    Raises ``ValueError`` for noise of zero, and for a domain that is not studied.
     """
     if not noise > 0:
         raise ValueError(f"noise is a multiple, above zero, of the study's own; got {noise}")

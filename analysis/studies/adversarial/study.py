@@ -89,7 +89,7 @@ class Outcome(NamedTuple):
 
 @lru_cache(maxsize=8)
 def learner(name: str, method: str, plan: Plan) -> Learner:
-    """The learner of a task by a method; compiled once a process. ``ValueError`` for another method."""
+    """Make the learner of a task by a method; compiled once a process. ``ValueError`` for another method."""
     if method not in STUDIED:
         raise ValueError(f"the method is one of {'; '.join(STUDIED)}; got {method!r}")
     of = case(name, plan)
@@ -137,7 +137,7 @@ _REGRESSION = Regression(
 
 
 def _gathered(method: str, plan: Plan) -> int:
-    """How many sessions' demonstrations are learned from at once: SSRR's ranking needs a long session."""
+    """Return the number of sessions that are learned from at once: SSRR's ranking needs a long session."""
     halved = method == SSRR and plan.sessions % _SSRR_SESSIONS == 0
     return plan.sessions // _SSRR_SESSIONS if halved else 1
 
@@ -187,7 +187,7 @@ def _sensor_numbers(sensor: Any) -> Float[np.ndarray, " p"]:
 
 
 def _session(whole: Recording, session: int, seed: int, trajectories: int) -> Recording:
-    """A session's demonstrations: the next of those there are, other ones first for another seed."""
+    """Return a session's demonstrations: the next ones in order, from another place for another seed."""
     total = whole.live.shape[0]
     order = np.random.default_rng(seed).permutation(total)
     places = (session * trajectories + np.arange(trajectories)) % total
@@ -225,7 +225,7 @@ def _error(of: Case, network: Any, policy: Any, key: Array) -> EmpiricalILE:
 
 
 def _belief(of: Case, policy: Any, truth: Recording, reported: Recording) -> Belief:
-    """What the last policy makes of the beginning of the last demonstration."""
+    """Complete the beginning of the last demonstration under the last policy."""
     names, columns = of.components
     steps = min(_SHOWN_STEPS, int(reported.lengths[0]))
 
@@ -269,7 +269,7 @@ def adversarial_study(
     machine: str = "",
     advance: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> AdversarialResults:
-    """All replications of all methods on one task.
+    """Run all replications of all methods on one task.
 
     Runs found in ``folder`` are not run again, and new ones are kept there. Raises ``ValueError`` for another
     name than :data:`~i2rl.analysis.studies.adversarial.cases.PLANS` has, and for fewer than one seed or
@@ -348,7 +348,7 @@ def _all_runs(
 
 
 def _kept(name: str, method: str, seed: int, plan: Plan, folder: Path | None) -> Outcome:
-    """A run, from disk where it was kept."""
+    """Load a finished replication from disk."""
     if folder is None:
         return run(name, method, seed, plan)
     path = Path(folder) / name / f"{plan.digest}-{method.replace(' ', '_').replace(',', '')}-{seed}.json"

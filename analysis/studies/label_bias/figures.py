@@ -32,7 +32,7 @@ _PATHS = 5
 
 
 def draw_world(study: LabelBiasStudy, theme: Theme) -> Figure:
-    """The median world with the ways of some trajectories, from the least reward to the most."""
+    """Draw the median world with the paths of some trajectories, from the least reward to the most."""
     world = study.world
     rows, columns = world.walls.shape
     figure = new_figure(theme, 6.4, 5.2)
@@ -124,7 +124,7 @@ def draw_scatter(study: LabelBiasStudy, theme: Theme) -> Figure:
 
 
 def _critical(n: int) -> float:
-    """The correlation of ``n`` pairs that is just significant at 0.05."""
+    """Compute the correlation of ``n`` pairs that is just significant at 0.05."""
     from scipy.stats import t
 
     quantile = t.ppf(0.975, n - 2)
@@ -132,7 +132,7 @@ def _critical(n: int) -> float:
 
 
 def draw_settings(study: LabelBiasStudy, theme: Theme) -> Figure:
-    """Every world's correlation, one row a setting."""
+    """Draw every world's correlation, one row a setting."""
     from .study import PRINTED_RHO
 
     figure = new_figure(theme, 9.0, 1.6 + 0.42 * len(study.results))

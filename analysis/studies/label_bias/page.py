@@ -52,7 +52,7 @@ def _rows(study: LabelBiasStudy) -> list[dict[str, Any]]:
 
 
 def summary(study: LabelBiasStudy) -> dict[str, Any]:
-    """Settings and results as plain data; None where no world has a correlation."""
+    """Return settings and results as plain data; None if no world has a correlation."""
     told: dict[str, Any] = plain({"provenance": study_provenance(study.seed), **_summary(study)})
     return told
 
@@ -181,7 +181,7 @@ not a property of the method. That the correlation can be anything is."""
 
 
 def _conditions(study: LabelBiasStudy) -> str:
-    """Where BIRL's correlation is and is not significant in more than half of the worlds, in words."""
+    """Write when BIRL's correlation is and is not significant in more than half of the worlds."""
     told = []
     for title, results, name in (
         ("Of the settings, the correlation is", study.results, lambda r: r.setting.name),

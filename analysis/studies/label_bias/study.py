@@ -244,7 +244,7 @@ def correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> Corre
 
 
 def _spread(x: np.ndarray) -> float:
-    """Standard deviation; zero where it is no more than rounding."""
+    """Compute the standard deviation; zero if it is no more than rounding."""
     spread = float(np.std(x))
     return spread if spread > 1e-12 * (1 + float(np.abs(x).max())) else 0.0
 
@@ -388,7 +388,7 @@ def _walk(
 
 
 def quantiles(rho: Float[np.ndarray, " worlds"]) -> tuple[float, float, float]:
-    """The 5 %, 50 % and 95 % quantiles over the worlds with a correlation; NaN if there is none."""
+    """Compute the 5 %, 50 % and 95 % quantiles over the worlds with a correlation; NaN if there is none."""
     known = rho[np.isfinite(rho)]
     low, median, high = np.quantile(known, (0.05, 0.5, 0.95)) if len(known) else [np.nan] * 3
     return float(low), float(median), float(high)

@@ -45,7 +45,7 @@ _CORRIDOR, _WALL = 1.44, 0.28
 
 
 def bits_by_bout(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
-    """Running bits per decision against bouts, a panel for each view; every line named at its end."""
+    """Draw running bits per decision against bouts, a panel for each view; every line named at its end."""
     figure = new_figure(theme, 6.2 * len(result.views), 4.6)
     panels = figure.subplots(1, len(result.views), squeeze=False, sharey=True)[0]
     bouts = np.arange(1, len(result.decisions) + 1)
@@ -90,7 +90,7 @@ def bits_by_bout(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
 
 
 def _method_styles(theme: Theme, result: LabyrinthStudy) -> dict[str, dict[str, Any]]:
-    """Looks of the methods without their markers, the learner's line above and wider than the others."""
+    """Return the methods' styles without markers, the learner's line above and wider than the others."""
     names = [p.method for view in result.views for p in view.predictions]
     styles = {
         name: {**style, "marker": None, "linewidth": 1.4}
@@ -114,7 +114,7 @@ def _spread(heights: Float[np.ndarray, " m"], gap: float) -> Float[np.ndarray, "
 
 
 def value_on_maze(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
-    """The learned value of every place on the maze, a panel for each view, one scale of colours for all."""
+    """Draw the learned value of every place on the maze, a panel a view, one scale of colours for all."""
     figure = new_figure(theme, 5.4 * len(result.views) + 0.9, 5.3)
     panels = figure.subplots(1, len(result.views), squeeze=False)[0]
     by_node = [
@@ -134,7 +134,7 @@ def value_on_maze(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
 def values_by_node(
     maze: Labyrinth, weights: Float[np.ndarray, " K"], values: Float[np.ndarray, " S"]
 ) -> Float[np.ndarray, " 127"]:
-    """The value of stepping into each node from above, what it brings on the step included.
+    """Compute the value of stepping into each node from above, with the reward of that step.
 
     NaN for the root, into which no step leads from above.
     """

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 
 def summary(result: LabyrinthStudy) -> dict[str, Any]:
-    """The study as plain numbers (for JSON): every method's scores, weights by feature, values by state."""
+    """Return the study as plain numbers (for JSON): every method's scores, weights by feature, values by
+    state.
+    """
     mdp = result.maze.mdp
     views: dict[str, Any] = {}
     for view in result.views:
@@ -66,7 +68,7 @@ def summary(result: LabyrinthStudy) -> dict[str, Any]:
 
 
 def _estimates(result: LabyrinthStudy, view: ViewStudy) -> Estimates | None:
-    """All weights of a view with their errors; None where some of the maze was hidden."""
+    """List all weights of a view with their errors; None if part of the maze was hidden."""
     if view.learned.errors is None:
         return None
     return Estimates(result.maze.mdp.feature_names, view.learned.weights, view.learned.errors)

@@ -1,4 +1,4 @@
-"""What can be learned from a mouse in the labyrinth: prediction, bout by bout, of bouts not yet seen.
+"""Study of a mouse in the labyrinth: prediction, bout by bout, of bouts not yet seen.
 
 Before a learner learns from a bout it says how probable each of its decisions is; the code length of what
 the animal then did, in bits per decision, is the score (prequential: nothing is tested on what it has
@@ -70,7 +70,7 @@ LEARNER, BY_LEVEL, UNIFORM = "i2rl", "i2rl, by level", "uniform"
 
 
 class Prediction(NamedTuple):
-    """How well one method predicted each bout before learning from it.
+    """Prediction of each bout by one method before it learns from the bout.
 
     Fields
     ------
@@ -94,7 +94,7 @@ class Prediction(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """What the learner knew at the end.
+    """State of the learner at the end.
 
     Fields
     ------
@@ -254,7 +254,7 @@ def predict_with_learner(
 def predict_with_tables(
     maze: Labyrinth, demonstration: Demonstration, hidden: Bool[np.ndarray, " S"]
 ) -> list[Prediction]:
-    """The baselines, learning from the decisions in view and predicting all of them."""
+    """Predict all decisions by the baselines, which learn from the decisions in view."""
     n_states = maze.mdp.n_states
     choice = maze.choice
     everywhere, every_state = np.zeros(n_states, int), np.ones(n_states, bool)
@@ -285,7 +285,9 @@ def predict_with_table(
     context: Int[np.ndarray, " S"],
     teaches: Bool[np.ndarray, " S"],
 ) -> Prediction:
-    """Action frequencies given a context of the state, counted from one, in the states that ``teaches``."""
+    """Predict by action frequencies given a context of the state, counted from one, in the states that
+    ``teaches``.
+    """
     available = np.asarray(maze.mdp.available)
     counts = np.ones((context.max() + 1, available.shape[1]))
     teaches = teaches & ~hidden

@@ -147,7 +147,7 @@ class _Entry(NamedTuple):
 
 
 def turning_places(patrol: Patrol) -> Bool[np.ndarray, " S"]:
-    """Where a patroller turns round: it turns, and turns again in the same cell.
+    """Find where a patroller turns round: it turns, and turns again in the same cell.
 
     The goals DARKO is told of, from the true policy: in its favour, for nobody else is told anything.
     """
@@ -239,7 +239,7 @@ def _entries(patrol: Patrol) -> dict[str, _Entry]:
 
 
 def chosen_learning_rate(learning_rates: Sequence[float], scores: Float[np.ndarray, " rates"]) -> float:
-    """The smallest rate whose score is within 0.01 of the best: larger ones gain too little to tell."""
+    """Choose the smallest rate whose score is within 0.01 of the best."""
     good = np.asarray(scores) >= np.max(scores) - 0.01
     return min(float(learning_rate) for learning_rate, kept in zip(learning_rates, good, strict=True) if kept)
 
@@ -247,7 +247,7 @@ def chosen_learning_rate(learning_rates: Sequence[float], scores: Float[np.ndarr
 def _streams(
     key: Array, patrol: Patrol, sessions: int, replications: int
 ) -> list[tuple[Array, Demonstration]]:
-    """A key for the first weights, and the windows, of every patroller of every run."""
+    """Simulate the windows of every patroller of every replication, with a key for its first weights."""
     return [
         (jax.random.fold_in(one, p), windows)
         for one in jax.random.split(key, replications)
@@ -329,7 +329,7 @@ def _family(name: str) -> str:
 
 
 def summary(study: MethodsStudy) -> dict[str, Any]:
-    """Settings, curves, sweeps and the live Table 8.1 as plain data."""
+    """Return settings, curves, sweeps and the live Table 8.1 as plain data."""
     told: dict[str, Any] = plain(
         {
             "provenance": study_provenance(study.seed),

@@ -1,4 +1,4 @@
-"""What came of noisy reports: a sensor beside its posterior, one trajectory, and how onions are sorted."""
+"""Examples of noisy observations: a sensor beside its posterior, one trajectory, and sorted onions."""
 
 from __future__ import annotations
 
@@ -102,7 +102,7 @@ def sensor_posterior(
 def _agreement(
     features: Int[Array, "J S A"], pairs: Float[Array, "S A"], reliabilities: Float[Array, "draws J"]
 ) -> Float[Array, "draws J"]:
-    """As :func:`agreement_probabilities` of a :class:`FeatureNoise`, for many of them."""
+    """Compute :func:`agreement_probabilities` of many :class:`FeatureNoise`."""
 
     def one(p: Float[Array, " J"]) -> Float[Array, " J"]:
         return jnp.einsum("sa,jsa->j", pairs / pairs.sum(), FeatureNoise(features, p).agreement())
@@ -138,7 +138,7 @@ def strip(
     starts: Starts = "natural",
     steps: int = STRIP_STEPS,
 ) -> Strip:
-    """A fresh trajectory, interpreted with a learned reward and sensor."""
+    """Complete a fresh trajectory with a learned reward and sensor."""
     drawn = demonstrate_noisy(key, task, sessions=1, trajectories=1, steps=steps, starts=starts)
     sensor = FeatureNoise(task.features, np.asarray(reliabilities))
     pairs = _interpreted(drawn.mdp, sensor, jnp.asarray(weights), drawn.seen)
@@ -163,7 +163,7 @@ def sorted_belts(
     *,
     belts: int = BELTS,
 ) -> SortingTable:
-    """What the expert's and the learned policies do on simulated belts, beside the table of Figure 7.9.
+    """Tally the expert's and the learned policies on simulated belts, beside the table of Figure 7.9.
 
     The replications of a method share about ``belts`` belts, equally many each and at least one. Its tally
     has one entry a run, the sum over that run's belts: belts sorted with one policy are not independent. A
@@ -206,7 +206,7 @@ def per_belt(row: SortingRow) -> tuple[float, ...]:
 
 
 def _sorting_runs(table: SortingTable, row: SortingRow) -> str:
-    """How many replications have at least half the expert's recall."""
+    """Count the replications that have at least half the expert's recall."""
     if row.method == EXPERT:
         return ""
     enough = table.rows[0].tally.recall().value / 2
@@ -226,7 +226,9 @@ HEADINGS = (
 
 
 def belt_cells(table: SortingTable) -> list[tuple[str, ...]]:
-    """The rows as text under :data:`HEADINGS`, published ones beside ours, and those we have no row for."""
+    """Format the rows as text under :data:`HEADINGS`, published ones beside ours, and those we have no row
+    for.
+    """
 
     def percent(share: Share, digits: int) -> str:
         if math.isnan(share.value):

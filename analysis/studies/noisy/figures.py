@@ -83,7 +83,7 @@ def _panels(figure: Figure, n: int) -> np.ndarray:
 
 
 def _legend_above(panel: Axes, theme: Theme, title: str) -> None:
-    """A panel's own title and legend: more methods than there are styles share a figure."""
+    """Set a panel's own title and legend: more methods than there are styles share a figure."""
     legend = panel.legend(
         title=title,
         loc="lower left",
@@ -293,7 +293,7 @@ def sensor_plot(posterior: SensorPosterior, theme: Theme) -> Figure:
 
 
 def strip_plot(strip: Strip, mdp: TabularMDP, theme: Theme) -> Figure:
-    """A trajectory step by step: what was seen, what happened, and the posterior mass of each pair."""
+    """Draw a trajectory step by step: the observation, the truth, and the posterior mass of each pair."""
     length = len(strip.posterior)
     seen = strip.seen.state[0] * mdp.n_actions + strip.seen.action[0]
     true = strip.truth.state[0] * mdp.n_actions + strip.truth.action[0]

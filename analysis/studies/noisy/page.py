@@ -48,7 +48,7 @@ TARGETS = {PLAIN: (1 / 6, 1 / 12), AVERAGED: (1 / 12, 1 / 24), STEPWISE: (1 / 12
 
 
 def summary(study: NoisyStudy) -> dict[str, Any]:
-    """Settings and all measures as plain data."""
+    """Return settings and all measures as plain data."""
     told: dict[str, Any] = plain(
         {
             "provenance": study_provenance(study.seed),
@@ -187,12 +187,14 @@ def sensor_table(study: NoisyStudy) -> Table:
 
 
 def _identified(study: NoisyStudy, method: str) -> bool:
-    """Whether the sensor is known in at least half of the replications; what was not asked is not doubted."""
+    """Test whether the sensor is identified in at least half of the replications; true if that was not
+    tested.
+    """
     return method not in study.doubt or study.doubt[method].known >= 0.5
 
 
 def _quotable(study: NoisyStudy, method: str) -> bool:
-    """Whether an estimate of the sensor may be quoted: one without scores only if such a sensor is known."""
+    """Test whether to quote a sensor's estimate: one without scores only if the sensor is identified."""
     return method not in (PLAIN, BARE) or _identified(study, PLAIN)
 
 

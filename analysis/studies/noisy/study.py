@@ -112,7 +112,7 @@ class Streams(NamedTuple):
         return Demonstration(*(np.asarray(x)[run, session] for x in getattr(self, of)))
 
     def whole(self, run: int, of: str = "seen") -> Demonstration:
-        """All trajectories of a run."""
+        """Return all trajectories of a replication."""
         arrays = getattr(self, of)
         return Demonstration(*(np.asarray(x)[run].reshape(-1, x.shape[-1]) for x in arrays))
 
@@ -179,7 +179,8 @@ class MethodResult(NamedTuple):
 
 
 class SensorDoubt(NamedTuple):
-    """Whether the learned sensors are known, by run: see :mod:`i2rl.inference.learners.identification`.
+    """Identification of the learned sensors, by replication: see
+    :mod:`i2rl.inference.learners.identification`.
 
     Fields
     ------
@@ -254,7 +255,7 @@ class NoisyStudy(NamedTuple):
 
 
 class _Entry(NamedTuple):
-    """How a learner is made, what it is fed, and whether it estimates agreement."""
+    """Learner of a study, its input, and whether it estimates agreement."""
 
     learner: Callable[[TabularMDP, NoisyTask], Learner]
     fed: str = "seen"
@@ -283,7 +284,7 @@ METHODS = (*LEARNERS, ROBUST, MLIRL)
 
 
 class _Judge(NamedTuple):
-    """What learned agreement and weights are compared with."""
+    """Truth with which learned agreement and weights are compared."""
 
     task: NoisyTask
     true_agreement: Float[np.ndarray, " J"]
@@ -310,12 +311,12 @@ class _Judge(NamedTuple):
     def online(
         self, name: str, key: Array, learner: Learner, streams: Streams, entry: _Entry
     ) -> MethodResult:
-        """A learner on all streams."""
+        """Run a learner on all streams."""
         weights, agreement, state = _learned(key, learner, streams, entry)
         return self.result(name, np.arange(1, streams.seen.kind.shape[1] + 1), weights, agreement, state)
 
     def batch(self, name: str, key: Array, streams: Streams) -> MethodResult:
-        """A learner that is given all of a stream at once, on a few streams."""
+        """Run a learner on all sessions of a stream at once, on a few streams."""
         replications, sessions = streams.seen.kind.shape[:2]
         robust = robust_irl(streams.mdp, self.task.noise, slack=0.0, ridge=DEFAULT_RIDGE)
         weights = []
@@ -330,7 +331,7 @@ class _Judge(NamedTuple):
 
 @jax.jit
 def _hits(mdp: TabularMDP, optimal: Bool[Array, "S A"], weights: Float[Array, "N K"]) -> Float[Array, "N S"]:
-    """Where the greedy policy of each weights does what an expert does."""
+    """Test at which states the greedy policy of each weights agrees with the expert."""
 
     def one(w: Float[Array, " K"]) -> Float[Array, " S"]:
         policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, w)).optimal)
@@ -341,7 +342,7 @@ def _hits(mdp: TabularMDP, optimal: Bool[Array, "S A"], weights: Float[Array, "N
 
 
 def _judged_states(task: NoisyTask) -> Bool[np.ndarray, "3 S"]:
-    """All states, those with a choice, and those that can be reached from where the task naturally starts."""
+    """Return all states, those with a choice, and those reachable from the task's natural start."""
     available = np.asarray(task.mdp.available)
     return np.stack([np.ones(len(available), bool), available.sum(1) > 1, reachable_states(task.mdp)])
 
@@ -377,7 +378,7 @@ def _one_by_one(key: Array, learner: Learner, streams: Streams, run: int) -> tup
 
 
 def taken_at_face_value(mdp: TabularMDP, reports: Demonstration) -> tuple[TabularMDP, Demonstration]:
-    """Reports as what they say, for a learner that knows no noise: each pair by itself, anywhere.
+    """Take observations for truths, for a learner without a noise model: each pair by itself, anywhere.
 
     Wrong reports follow one another as no process could, so transitions say nothing; pairs that are not
     offered at all are dropped.
@@ -493,7 +494,7 @@ def noisy_study(
 
 
 def _seconds(methods: Sequence[str], task: NoisyTask, streams: Streams) -> dict[str, float]:
-    """Of the first stream, gone through twice: compiled in one pass, timed in the other.
+    """Time the first stream, learned twice: the first time compiles.
 
     Learners take turns, so that whatever else the machine does slows all of them alike.
     """
@@ -545,7 +546,7 @@ def _examples(
     belts: int,
     draws: int,
 ) -> tuple[SensorPosterior | None, Strip, SortingTable | None]:
-    """Of the first stream: its early sessions' posterior, and a new trajectory as it is understood."""
+    """Return the posterior of the first stream's early sessions, and the completion of a new trajectory."""
     learned, early = results[PLAIN], min(EARLY, streams.seen.kind.shape[1])
     assert learned.agreement is not None
     sample, walk, belt = jax.random.split(key, 3)

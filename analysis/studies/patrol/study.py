@@ -62,7 +62,7 @@ Advance = Callable[[str, float | None], None]
 
 
 class MethodResult(NamedTuple):
-    """What a method reached; the first axis runs over independent replications and the patrollers of each.
+    """Results of a method; the first axis ranges over independent replications and the patrollers of each.
 
     Fields
     ------
@@ -384,7 +384,7 @@ def _rows(study: Study) -> list[dict[str, Any]]:
 
 
 def summary(study: Study) -> dict[str, Any]:
-    """The study's settings and results as plain data."""
+    """Return the study's settings and results as plain data."""
     reward: dict[str, Any] = {
         "features": list(study.patrol.mdp.feature_names),
         "true weights": study.patrol.weights,

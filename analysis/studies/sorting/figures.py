@@ -55,7 +55,7 @@ class Embedding(NamedTuple):
 
 
 def embed(features: Float[np.ndarray, "n K"]) -> Embedding:
-    """The two directions along which features vary most, and where each trajectory lies (PCA by SVD).
+    """Project on the two directions along which features vary most, and place each trajectory (PCA by SVD).
 
     The largest loading of each direction is positive. Fewer than two varying directions leave zeros.
     """
@@ -150,13 +150,13 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
 
 
 def _loading(mdp: TabularMDP, loading: Float[np.ndarray, " K"]) -> str:
-    """The two features that a component weighs most, signed; short."""
+    """Name the two features that a component weighs most, signed; short."""
     top = [k for k in np.argsort(-np.abs(loading))[:2] if loading[k]]
     return ", ".join(f"{'more' if loading[k] > 0 else 'less'} {mdp.feature_names[k]!r}" for k in top)
 
 
 def _numbered(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> list[int]:
-    """The ways that have trajectories: as the behaviours they match, then those that match none."""
+    """Order the components that have trajectories: by the behaviours they match, then the unmatched ones."""
     matched = [component for _, component in sorted(match_components(labels, assignments).items())]
     return matched + [component for component in np.unique(assignments).tolist() if component not in matched]
 
@@ -189,7 +189,7 @@ class Flow(NamedTuple):
 
 
 def flow_of(sorting: Sorting, policy: Float[np.ndarray, "S A"], steps: int) -> Flow:
-    """Where ``steps`` steps of a policy are spent, and how it gets from place to place."""
+    """Compute where ``steps`` steps of a policy are spent, and the flow from place to place."""
     mdp = sorting.mdp
     always = jnp.broadcast_to(jnp.asarray(policy), (steps, *policy.shape))
     share = np.asarray(finite_occupancy(mdp, always)).mean(0)
@@ -214,7 +214,7 @@ def flow_of(sorting: Sorting, policy: Float[np.ndarray, "S A"], steps: int) -> F
 
 
 def components_diagram(study: SortingStudy, theme: Theme) -> Figure:
-    """What each way found makes of an onion: a state diagram a way, of the first method of the study.
+    """Draw each component found as a state diagram of an onion, of the first method of the study.
 
     Boxes are where the onion is and what is thought of it (hand and list left out); arrows are what the
     greedy policy of the learned weights does.
@@ -348,7 +348,7 @@ def _arrow(axes: Axes, theme: Theme, here: Place, there: Place, actions: dict[in
 
 
 def _border(centre: tuple[float, float], towards: tuple[float, float]) -> tuple[float, float]:
-    """Where the line between two boxes leaves the first."""
+    """Find the point where the line between two boxes leaves the first."""
     dx, dy = towards[0] - centre[0], towards[1] - centre[1]
     reach = min(_HALF[0] / abs(dx) if dx else np.inf, _HALF[1] / abs(dy) if dy else np.inf)
     return centre[0] + dx * reach, centre[1] + dy * reach

@@ -38,7 +38,7 @@ if TYPE_CHECKING:
 
 
 def summary(study: SortingStudy) -> dict[str, Any]:
-    """Settings and all measures as plain data."""
+    """Return settings and all measures as plain data."""
     told: dict[str, Any] = plain(
         {
             "provenance": study_provenance(study.seed),
@@ -186,7 +186,7 @@ so taking a picker for a roller costs its first steps only.
 
 
 def _scope(study: SortingStudy) -> str:
-    """What the numbers of trajectories leave open; empty if nothing."""
+    """Write what the numbers of trajectories leave open; empty if they cover everything."""
     told = []
     if tuple(study.counts) == FEW[study.tasks]:
         told.append(

@@ -56,7 +56,7 @@ METHODS = {
 
 
 class Measures(NamedTuple):
-    """What is measured of a method, each ``[replications, T]``.
+    """Measures of a method, each ``[replications, T]``.
 
     Fields
     ------
@@ -392,7 +392,7 @@ def _online(
 def _explained(
     mdp: TabularMDP, state: Any, log_likelihood: float, demonstration: Demonstration
 ) -> Clustering:
-    """All trajectories so far under what an online learner knows now; it has kept none of them."""
+    """Explain all trajectories so far by an online learner's current state; it holds none of them."""
     proportions = np.asarray(state.proportions)
     present = np.argsort(-proportions, kind="stable")[: np.count_nonzero(proportions)]
     shares = assign_trajectories(mdp, None, state.weights, proportions, demonstration)[:, present]

@@ -187,7 +187,7 @@ def _policies(sorting: Sorting, values: np.ndarray) -> Float[np.ndarray, "B S A"
 
 
 def sorting_table_summary(table: SortingTable) -> dict[str, Any]:
-    """The table as plain data for JSON: shares in [0, 1], ``None`` where nothing was binned."""
+    """Return the table as plain data for JSON: shares in [0, 1], ``None`` if no onion was binned."""
     return {
         "belts": table.belts,
         "line": table.line._asdict(),
@@ -222,7 +222,7 @@ HEADINGS = ("method", "belts", "TP, FP, TN, FN", "precision, %", "recall, %", "L
 
 
 def caption(table: SortingTable) -> str:
-    """What the columns mean."""
+    """Write the meaning of the columns."""
     return (
         "TP, FP: blemished and good onions in the bin; TN, FN: good and blemished ones left on the table. "
         f"Simulated: means of {counted(table.belts, 'belt')}; dissertation: its one belt of 24 onions. In "
@@ -232,7 +232,7 @@ def caption(table: SortingTable) -> str:
 
 
 def behaviours(table: SortingTable) -> tuple[str, ...]:
-    """The behaviours of the table, in its order."""
+    """List the behaviours of the table, in its order."""
     return tuple(dict.fromkeys(row.behaviour for row in table.rows))
 
 
