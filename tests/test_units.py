@@ -1,4 +1,4 @@
-"""What is learned does not depend on the units of the features: for every learner, program and posterior.
+"""Independence from the units of the features: for every learner, program and posterior.
 
 The benchmark ``units`` runs every method in more units than there is time for here.
 """

@@ -1,4 +1,4 @@
-"""How far reports and posteriors can be apart, against enumeration."""
+"""Distances of observations and of posteriors, against enumeration."""
 
 import itertools
 

@@ -48,7 +48,7 @@ def reports():
 
 
 def stops_of(rule, reports):
-    """The rule itself, after every session of every stream."""
+    """Apply the rule itself, after every session of every stream."""
     return [next((i for i in range(1, len(stream) + 1) if rule(stream[:i])), NEVER) for stream in reports]
 
 

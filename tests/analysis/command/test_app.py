@@ -54,7 +54,7 @@ def circle(discount: float = 0.9) -> TabularMDP:
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once(tmp_path_factory):
-    """Every ``learn`` compiles its learner; here, and in the processes started here, only the first does."""
+    """Share compiled programs between all ``learn`` commands here, also those in other processes."""
     settings = {
         "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")),
         "jax_persistent_cache_min_compile_time_secs": 0.0,
@@ -74,7 +74,7 @@ def compiled_once(tmp_path_factory):
 
 @pytest.fixture
 def house(tmp_path):
-    """A folder with an MDP, demonstrations, and the options that learn from them."""
+    """Make a folder with an MDP, demonstrations, and the options that learn from them."""
     save_mdp(tmp_path / "circle.npz", circle(), IN_VIEW)
     (tmp_path / "demos.jsonl").write_text("".join(LINES))
     return tmp_path
@@ -162,7 +162,7 @@ def test_the_version_is_printed():
 
 
 def numeric_options() -> list[tuple[list[str], str, bool]]:
-    """Every option that takes a number: its command, its name, and whether the number is whole."""
+    """List every option that takes a number: its command, its name, and whether the number is whole."""
     found = []
     for path in every_command():
         command = typer.main.get_command(app)

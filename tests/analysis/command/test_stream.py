@@ -45,7 +45,7 @@ def round_trip() -> TabularMDP:
 
 
 def trajectory(seed: int, agent: int | None = None) -> str:
-    """A line about somebody who goes on, and half of the time waits in the kitchen."""
+    """Write a line about a walk that goes on, and half of the time waits in the kitchen."""
     rng = np.random.default_rng(seed)
     state, steps = int(rng.integers(5)), []
     for _ in range(4):
@@ -73,7 +73,7 @@ class Interrupted(Exception):
 
 
 def interrupted(lines: Iterable[str]) -> Iterator[str]:
-    """The lines, and then no end of the input but an interruption."""
+    """Yield the lines, and then an interruption instead of the input's end."""
     yield from lines
     raise Interrupted
 
@@ -321,7 +321,7 @@ REASONS = [
 
 
 def spoilt(lines: list[str]) -> list[str]:
-    """The lines, with a bad one after each of the first six."""
+    """Insert a bad line after each of the first six."""
     return [x for i, line in enumerate(lines) for x in (line, *BAD[i : i + 1])]
 
 

@@ -37,7 +37,7 @@ def _no_warnings():
 
 
 def drawn(figure: Figure) -> Figure:
-    """Rendered, so that whatever drawing raises or warns of shows."""
+    """Render the figure, so that errors and warnings of drawing show."""
     FigureCanvasAgg(figure).draw()
     return figure
 

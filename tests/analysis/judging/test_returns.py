@@ -209,7 +209,7 @@ def test_fishers_interval_covers_the_truth_as_often_as_it_says():
 
 
 def test_steps_of_a_trajectory_depend_on_each_other_and_the_bootstrap_knows():
-    """Both rewards share most of their trajectory's level, so that steps repeat what trajectories say."""
+    """Share most of a trajectory's level between both rewards, so that steps repeat the trajectory."""
     rng, rho, trajectories, steps, repeats = np.random.default_rng(3), 0.5, 40, 25, 150
     fisher = bootstrap = 0
     live = np.ones((trajectories, steps), bool)

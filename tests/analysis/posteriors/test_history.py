@@ -37,7 +37,7 @@ class State(NamedTuple):
 
 @pytest.fixture(scope="module")
 def learner(mdp):
-    """Keeps the visits, and weighs a feature by how often it was collected."""
+    """Make a learner that accumulates visits and weighs a feature by its frequency."""
 
     def session(state, demonstration):
         pairs = jnp.zeros((mdp.n_states, mdp.n_actions)).at[demonstration.state, demonstration.action].add(1)

@@ -32,7 +32,7 @@ TASKS = {"sorting": sorting_task, "patrol": patrol_task}
 
 
 def states_22() -> list[str]:
-    """The 22 states as digits (onion, prediction, hand), in the order of the process."""
+    """List the 22 states as digits (onion, prediction, hand), in the order of the process."""
     held = [f"3{p}3" for p in range(3)] + [f"1{p}1" for p in range(3)]
     return [f"0{p}{h}" for p in range(3) for h in range(4)] + held + [f"22{h}" for h in range(4)]
 
@@ -218,7 +218,7 @@ def test_agreement_of_the_patrol_is_one_less_the_noise_on_moves_and_right_turns(
 
 
 def exact_report_counts(task: NoisyTask, noise: SwapNoise | FeatureNoise, truth: np.ndarray) -> np.ndarray:
-    """Expected reports [S*A], given how often each truth [S*A] occurred."""
+    """Compute the expected observations [S*A], given how often each truth [S*A] occurred."""
     size = truth.size
     return truth @ table_of(noise).reshape(size, size)
 

@@ -343,7 +343,7 @@ def test_values_stay_between_penalty_and_reward(seed):
 
 
 def standing_guard(*states):
-    """A patrol whose members never move from where they are."""
+    """Make a patrol whose members never move."""
     weights = -np.ones(6)
     assert (greedy_policy(PATROL.mdp, weights)[:, 1:3] == 0).all()
     still = jnp.zeros(S).at[jnp.array([patroller(*s) for s in states])].set(1 / len(states))

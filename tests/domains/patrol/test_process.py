@@ -54,12 +54,12 @@ def index_of(patrol, *state):
 
 
 def follow(patrol, state, action):
-    """The state an action intends: the likelier of the listed successors."""
+    """Return the state that an action intends: the likelier of the listed successors."""
     return patrol.states[int(patrol.mdp.successors[index_of(patrol, *state), action, 0])]
 
 
 def expert_cycle(patrol, start, steps=200):
-    """The loop that the optimal policy settles into if every move succeeds."""
+    """Follow the optimal policy to its loop if every move succeeds."""
     policy = patrol.expert_policy().argmax(1)
     successors = np.asarray(patrol.mdp.successors)[..., 0]
     path = [start]
@@ -314,7 +314,7 @@ def meetings(patrol, states):
 
 
 def expected_actions(patrol, states, interaction):
-    """What the passing rule makes of a joint walk, step by step; None where a patroller is free to act."""
+    """Apply the passing rule to a joint walk, step by step; None where a patroller is free to act."""
     meet, counter, rows = meetings(patrol, states), 0, []
     for t in range(states.shape[1]):
         if counter <= 0 and meet[t]:

@@ -215,7 +215,7 @@ def test_what_is_written_is_read(tmp_path, sorted_belts):
 
 
 def _check_facts(states, actions):
-    """What is true of every released recording: actions lead to the next wrist, and no onion is missorted."""
+    """Check every released recording: actions lead to the next wrist, and every onion is sorted correctly."""
     np.testing.assert_allclose(np.diff(states[:, 6:9], axis=0), STRIDE * actions[:-1], atol=1e-9)
     labels = states[:, 12::4]
     np.testing.assert_array_equal(labels[-1] == -1, labels[0] == 0)

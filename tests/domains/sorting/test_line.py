@@ -21,7 +21,7 @@ def tally(behaviour: int, line: Line = Line(), *, seed: int = 0, belts: int = BE
 
 
 def agrees(counts: np.ndarray, expected: float) -> bool:
-    """Whether an exact expectation lies within four standard errors of a simulated mean."""
+    """Test whether an exact expectation lies within four standard errors of a simulated mean."""
     return abs(counts.mean() - expected) < 4 * counts.std(ddof=1) / np.sqrt(len(counts)) + 1e-12
 
 
@@ -55,7 +55,7 @@ def expected_of_picking(line: Line) -> np.ndarray:
         stays = np.array(ahead(phase, clock, bad, good, blemished)) * line.slip
 
         def claimed(phase: str) -> np.ndarray:
-            """A random other onion is claimed."""
+            """Claim a random other onion."""
             left, total = bad + good, np.zeros(2)
             if bad:
                 total += bad / left * np.array(ahead(phase, clock, bad - 1, good, True))

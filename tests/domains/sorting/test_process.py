@@ -136,7 +136,7 @@ def derived_mdp(states: list[str], which: str, coded: bool) -> TabularMDP:
 
 
 def choices(mdp: TabularMDP, states: list[str], weights: np.ndarray) -> dict[str, str]:
-    """The optimal action's letter in every state; fails on a tie."""
+    """Return the optimal action's letter in every state; fail on a tie."""
     optimal = np.asarray(_plan(mdp, weights).optimal)
     assert (optimal.sum(1) == 1).all()
     return dict(zip(states, (LETTERS[a] for a in optimal.argmax(1)), strict=True))

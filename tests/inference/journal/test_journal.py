@@ -113,7 +113,7 @@ def committed(path: Path, learner: Toy, sessions: int) -> None:
 
 
 def bits(tree: Any) -> list[tuple]:
-    """Everything that tells two trees apart: containers, types, shapes and bits."""
+    """List everything that distinguishes two trees: containers, types, shapes and bits."""
 
     def of(leaf: Any) -> tuple:
         if isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
@@ -668,7 +668,7 @@ def damaged(path: Path, *statements: str) -> None:
 
 @pytest.fixture
 def twelve(learner: Toy, tmp_path: Path) -> Path:
-    """A closed journal of twelve sessions."""
+    """Write a closed journal of twelve sessions."""
     with Journal.open(tmp_path / "j", learner) as journal:
         for state, report in learned(learner, 12):
             journal.commit(state, report, Position(state.session, "00"), bytes([state.session]))
@@ -794,7 +794,7 @@ def test_a_damaged_state_is_not_learned_on_from(
 
 
 def crafted(header: bytes, content: bytes = b"", length: int | None = None) -> bytes:
-    """A tree with this header, whose checksum is right."""
+    """Write a tree with this header and a right checksum."""
     body = b"i2rltree" + struct.pack("<I", len(header) if length is None else length) + header + content
     return body + hashlib.blake2b(body, digest_size=16).digest()
 
@@ -896,7 +896,7 @@ PRAGMA user_version=1;
 
 
 def version_1(path: Path, learner: Toy, sessions: int) -> list[tuple[State, SessionInfo]]:
-    """A journal as version 1 wrote it."""
+    """Write a journal as version 1 wrote it."""
     history = learned(learner, sessions)
     connection = sqlite3.connect(path)
     connection.executescript(VERSION_1)
@@ -1096,7 +1096,7 @@ def test_a_log_cut_anywhere_leaves_whole_sessions(seed: int, learner: Toy, tmp_p
 
 @pytest.fixture(scope="module")
 def adversity(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What became of journals that were killed at every write, filled their disks, and were damaged."""
+    """Kill writers at every write, fill their disks, damage their journals, and collect the outcomes."""
     folder = tmp_path_factory.mktemp("adversity")
     options = ["--file-systems", "0", "--damaged", "150"]
     done = subprocess.run(

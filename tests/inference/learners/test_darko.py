@@ -134,7 +134,7 @@ def test_rate_and_radius_act_as_named(world):
 
 
 def impossible_pair(mdp):
-    """An action its state does not have, in arrays as large as the other sessions'."""
+    """Make an unavailable action of a state, in arrays as large as the other sessions'."""
     s, a = np.argwhere(~np.asarray(mdp.available))[0]
     return Demonstration.from_pairs([[s]], [[a]]).padded(2, 4)
 

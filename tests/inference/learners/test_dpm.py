@@ -44,14 +44,14 @@ def trajectories(demonstrate):
 
 @pytest.fixture(scope="module")
 def long_run(mdp, trajectories):
-    """Many sweeps of the sampler with moves wide enough to bounce off the box's walls."""
+    """Run many iterations of the sampler with moves wide enough to bounce off the box's walls."""
     return dpm_birl(
         mdp, rationality=ETA, alpha=ALPHA, iterations=8_000, proposals=1, updates=1, sigma=0.4
     ).sample(jax.random.key(0), trajectories)
 
 
 def partitions(n):
-    """All partitions of ``n`` things, as labels by first appearance."""
+    """List all partitions of ``n`` things, as labels by first appearance."""
     found = [(0,)]
     for _ in range(n - 1):
         found = [(*p, label) for p in found for label in range(max(p) + 2)]

@@ -57,7 +57,7 @@ def sensor():
 
 @pytest.fixture(scope="module")
 def demonstration(mdp, sensor):
-    """Simulated, with a lost frame, a shorter trajectory, and two that are wholly hidden."""
+    """Simulate, with a lost frame, a shorter trajectory, and two that are wholly hidden."""
     law = TrajectoryLaw(mdp, jnp.array([1.5, -1.0]), sensor, 5)
     codes = np.array(sample_demonstration(jax.random.key(5), law, 12).codes)
     codes[0, 2] = [3, -1, -1]

@@ -33,7 +33,7 @@ GRIDS = {2: simplex_grid(2, 4000), 3: simplex_grid(3, 200), 4: simplex_grid(4, 4
 
 
 def random_problem(rng):
-    """Counts far above, around and far below the strength; equal, nearly equal, or not at all."""
+    """Draw counts far above, around and far below the strength; equal, nearly equal, or not at all."""
     n_components = int(rng.integers(2, 5))
     counts = rng.gamma(rng.choice([0.2, 1.0, 5.0]), 1.0, n_components)
     if rng.random() < 0.5:

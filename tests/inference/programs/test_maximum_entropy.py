@@ -313,7 +313,7 @@ def test_dependent_features_get_finite_weights_and_the_right_behaviour():
 
 
 def session_targets(mdp, truth, n, seed=0):
-    """Running averages as sessions deliver them: the target settles while demonstrations come in."""
+    """Simulate running averages of sessions: the target settles while demonstrations come in."""
     rng = np.random.default_rng(seed)
     exact = expert_target(mdp, truth)
     return [

@@ -79,12 +79,12 @@ def tables(logits: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def by_class(classes, pairs: np.ndarray) -> np.ndarray:
-    """Sums ``[C]`` of ``[SA]``."""
+    """Sum ``[SA]`` by class to ``[C]``."""
     return np.bincount(np.asarray(classes.of_pair).ravel(), pairs.ravel(), len(classes.reportable))
 
 
 class Confidences(NamedTuple):
-    """Of a mode: what the functions take, and its value at each step and truth, NaN for a plain report."""
+    """Confidences of a mode: the functions' input, and its value at each step and truth, NaN for no score."""
 
     given: np.ndarray
     everywhere: np.ndarray
@@ -203,7 +203,7 @@ def test_unscored_evidence_is_that_of_noise_on_features(mask):
 
 
 def posterior(rows: list, mode: str, logits: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Of the truth at each step, under an uneven prior."""
+    """Compute the posterior of the truth at each step, under an uneven prior."""
     joint = enumerated_evidence(rows, mode, logits, mask) * np.linspace(0.5, 2.0, SA)
     return joint / joint.sum(2, keepdims=True)
 
@@ -307,7 +307,7 @@ class Problem(NamedTuple):
         )
 
     def expected(self, logits: np.ndarray) -> np.ndarray:
-        """Matches of plain and wrong reports under these reliabilities."""
+        """Compute the matches of plain and wrong observations under these reliabilities."""
         plain, wrong = tables(logits, self.mask)
         joint = self.plain.sum(1)[:, None] * plain + self.wrong.sum(1)[:, None] * wrong
         return (agreements() * joint).sum((1, 2))

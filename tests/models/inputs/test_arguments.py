@@ -1,4 +1,4 @@
-"""What users give: sensors, demonstrations and keys in any form, checked wherever there are numbers."""
+"""Users' inputs: sensors, demonstrations and keys in any form, checked wherever there are numbers."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ def simulated(key, mdp, sensor, n):
 
 @pytest.fixture(scope="module")
 def demonstration(mdp, sensor):
-    """Simulated, wholly seen rows among them, with lost frames, a short trajectory and a repeated one."""
+    """Simulate, wholly seen rows among them, with lost frames, a short trajectory and a repeated one."""
     codes = np.array(simulated(jax.random.key(1), mdp, sensor, 7))
     codes[0, 1] = [3, -1, -1]
     codes[1, 2:] = [0, -1, -1]

@@ -316,7 +316,7 @@ HIDDEN_DEMO = Demonstration.from_steps([[(0, 1), "hidden", (2, 0)], [(2, None), 
 
 
 def columns(fill):
-    """The states and actions of ``HIDDEN_DEMO`` with a value where there is none."""
+    """Return the states and actions of ``HIDDEN_DEMO``, with a value at hidden steps."""
     return [[0, fill, 2], [2, 0, fill]], [[1, fill, 0], [fill, 0, fill]]
 
 

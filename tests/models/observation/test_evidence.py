@@ -31,7 +31,7 @@ def confusion(seed=0):
 
 
 def walk(**options):
-    """Action 0 stays, action 1 moves on: 0 to 1 to 2, where it ends. Starts in 0."""
+    """Build a process: action 0 stays, action 1 moves on: 0 to 1 to 2, where it ends. Starts in 0."""
     successors = np.array([[[0], [1]], [[1], [2]], [[2], [2]]])
     return TabularMDP.from_successors(
         successors, np.ones((S, A, 1)), np.zeros((S, A, 1)), initial=np.array([1.0, 0, 0]), **options

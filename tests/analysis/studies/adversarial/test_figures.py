@@ -238,7 +238,7 @@ def test_cells_are_shown_where_they_are():
 
 
 def test_silhouettes_are_the_robots(hopper):
-    """Every point of a limb's outline is a radius away from the line between its ends."""
+    """Check that every outline point of a limb is a radius away from the line between its ends."""
     figure = frames_plot(hopper.frames, LIGHT, "Hopper")
     (strip,) = hopper.frames
     limbs = [p for p in figure.axes[0].patches if isinstance(p, Polygon)]

@@ -34,7 +34,7 @@ TRIALS, SESSIONS = 3, 2
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
-    """The folder of a tiny report, and the JSON printed with it."""
+    """Return the folder of a tiny page, and the JSON printed with it."""
     folder = tmp_path_factory.mktemp("report")
     small = partial(patrol_results, trials=TRIALS, iterations=3)
     command = ["run", "robust-airl", "--domain", "patrol", "--replications", "1", "--sessions", str(SESSIONS)]

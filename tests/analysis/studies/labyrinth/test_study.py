@@ -40,7 +40,7 @@ NOTHING = np.zeros(MAZE.mdp.n_states, bool)
 
 
 def thirsty_weights():
-    """A mouse that dislikes turning, explores, and climbs towards the water port."""
+    """Return the weights of a mouse that dislikes turning, explores, and climbs towards the water port."""
     weights = dict.fromkeys(MAZE.mdp.feature_names, 0.0)
     weights |= {"turns round": -1.5, "goes deeper": 0.7, "reaches home": 1.0, "reaches the water port": 2.0}
     node = parent_of(WATER_PORT)

@@ -38,7 +38,7 @@ from i2rl.inference.learners.dpm import dpm_birl
 
 @cache
 def small():
-    """The quickest methods to compile, few and short trajectories."""
+    """Run the methods that compile fastest, on few and short trajectories."""
     return sorting_study.sorting_study(
         2, (6,), replications=2, steps=20, methods=("dpm-birl", "em-mlirl"), belts=20, n_components=3, seed=3
     )

@@ -36,7 +36,9 @@ RELEASED = {
 
 @cache
 def table():
-    """True weights rescaled, the behaviours confused, one that never bins, and a method nobody published."""
+    """Tabulate true weights rescaled, the behaviours confused, one that never bins, and an unpublished
+    method.
+    """
     sorting = sorting_with_claiming()
     picking, rolling, claiming = sorting.weights
     learned = {

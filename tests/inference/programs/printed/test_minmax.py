@@ -32,7 +32,7 @@ def accuracy(assignments, labels=LABELS):
 
 
 class Tiny:
-    """Every trajectory of three steps in a process of two states and two actions, five of them shown."""
+    """Trajectories of three steps in a process of two states and two actions, five of them demonstrated."""
 
     def __init__(self, seed, n_components=2, shown=5):
         rng = np.random.default_rng(seed)
