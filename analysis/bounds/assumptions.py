@@ -70,7 +70,7 @@ class Bound(NamedTuple):
 
     @property
     def undecided(self) -> tuple[Assumption, ...]:
-        """Assumptions that nobody has decided."""
+        """Assumptions still open."""
         return tuple(a for a in self.assumptions if a.holds is None)
 
     def assuming(self, **decided: bool) -> Bound:
@@ -162,13 +162,13 @@ def check(
     learner: Learner | None = None,
     state: Any = None,
 ) -> Bound:
-    """Decide the assumptions that can be decided from what is given; the others stay as they are.
+    """Check the assumptions that the arguments settle; the others stay open.
 
     Parameters
     ----------
     bound : Bound
     mdp : TabularMDP
-        Decides whether features lie in [0, 1]. Taken from ``learner`` if that is given.
+        Settles whether features lie in [0, 1]. Taken from ``learner`` if that is given.
     weights : float ``[K]``
         The expert's: whether they lie in [0, 1].
     expert : float ``[S, A]``
@@ -176,8 +176,8 @@ def check(
     length : int
         Steps of a trajectory: whether what lies beyond them is negligible against ``epsilon``.
     learner, state
-        The run: whether the program is the theorem's, and was solved within its slack in the state's
-        session (a bound on regret needs it of every session).
+        Settle whether the program is the theorem's, and was solved within its slack in the state's session (a
+        bound on regret needs it in every session).
 
     Raises
     ------

@@ -1,9 +1,9 @@
 """Concentration of a mean of independent values in [0, 1] about its expectation.
 
-Hoeffding's inequality, which the dissertation's theorems use, knows only the range. Where values vary
-little, as discounted feature averages do, the observed variance gives much narrower intervals: Maurer and
+Hoeffding's inequality, which the dissertation's theorems use, depends only on the range. For values that vary
+little, such as discounted feature averages, the observed variance gives much narrower intervals: Maurer and
 Pontil (2009), and the predictable plug-in intervals of Waudby-Smith and Ramdas (2023), whose confidence
-sequence holds at all sample sizes at once, so that an online learner may look at it after every session.
+sequence holds at all sample sizes at once, so that an online learner may check it after every session.
 
 Values are ``[..., n, K]``: ``n`` independent observations of ``K`` quantities. ``delta`` is the failure
 probability of *one* quantity's two-sided interval; for ``K`` at once give ``delta / K`` (union bound).
@@ -140,7 +140,7 @@ def bernstein_size(deviation: float, error: float, delta: float) -> int:
 def predictable_half_width(deviation: float, size: int, delta: float) -> float:
     """Predict the half-width of :func:`predictable_bernstein` for values of known deviation.
 
-    Includes the price of its first predictions for the least favourable expectation, 0 or 1.
+    Includes the cost of its first predictions for the least favourable expectation, 0 or 1.
     """
     variance, (t, count) = deviation**2, _blocks(size)
     # Expected squared error of the prediction before value t, which starts at 1/2 with a value's weight.

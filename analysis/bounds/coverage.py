@@ -1,10 +1,10 @@
 """Coverage and looseness of the bounds: replications against each theorem's promise.
 
 The expert obeys the model the theorems assume (the soft policy of weights in [0, 1]^K), trajectories are
-independent, and the program is the theorems': the one place where every assumption can be made true, so
-that a miss would be the theorem's. A run simulates ``n`` trajectories, fits, and asks whether the expert's
-expected log-likelihood is within the bound of the solution's. What lies beyond a trajectory's last step
-enters with its exact expectation under the expert, which keeps means and ranges exact.
+independent, and the program is the theorems': here every assumption holds, so a miss would refute the
+theorem. A replication simulates ``n`` trajectories, fits, and tests whether the expert's expected
+log-likelihood is within the bound of the solution's. The rest beyond a trajectory's last step enters with its
+exact expectation under the expert, so means and ranges are exact.
 """
 
 from __future__ import annotations

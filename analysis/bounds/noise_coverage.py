@@ -1,8 +1,8 @@
 """Replications against RIMEO's bounds: :mod:`.coverage` under noisy, estimated perception.
 
-The expert obeys the soft model; reports follow :class:`~i2rl.models.FeatureNoise` whose reliabilities are
-counted on ``n_o`` reports of known truth, as nothing else gives Hoeffding's ``epsilon_o``. Posteriors over
-what was done are exact.
+The expert obeys the soft model; observations follow :class:`~i2rl.models.FeatureNoise`. Its reliabilities are
+counted on ``n_o`` observations of known truth, as Hoeffding's ``epsilon_o`` requires. Posteriors over pairs
+are exact.
 """
 
 from __future__ import annotations
@@ -51,10 +51,10 @@ def noise_of(setting: Setting) -> FeatureNoise:
 def counted_reliabilities(
     key: Array, noise: FeatureNoise, replications: int, reports: int
 ) -> Float[Array, "replications J"]:
-    """Shares of ``reports`` that have each predicate right, as counted where the truth is known.
+    """Count the shares of ``reports`` observations of known truth that have each predicate right.
 
-    Half a report is the least and the most short of all. Raises ``ValueError`` unless predicates are reported
-    independently, which takes that every combination of them can be reported, equally often.
+    Shares stay half an observation away from 0 and 1. Raises ``ValueError`` unless predicates are observed
+    independently, which requires that every combination of them can be observed, equally often.
     """
     classes = predicate_classes(np.asarray(noise.predicates), np.asarray(noise.reportable))
     if len(classes.vectors) != 2 ** len(noise.predicates) or np.ptp(classes.reportable) > 0:
@@ -92,11 +92,11 @@ def complete_under(
 def perception_coverage(
     key: Array, setting: Setting, replications: int, size: int, draws: int, reports: int, delta: float
 ) -> list[Coverage]:
-    """Lemma 4 and Theorem 6 (Lemma 8 and Theorem 6 of appendix E), printed and corrected.
+    """Simulate Lemma 4 and Theorem 6 (Lemma 8 and Theorem 6 of appendix E), printed and corrected.
 
     ``delta`` is spent on each of ``epsilon`` (``size`` trajectories), ``epsilon_s`` (``size * draws`` sampled
-    completions in all) and ``epsilon_o`` (``reports``), which decide the errors. Hidden pairs are filled in
-    under the expert's weights. Raises ``ValueError`` as :func:`counted_reliabilities`.
+    completions in all) and ``epsilon_o`` (``reports``), which determine the errors. Hidden pairs are filled
+    in under the expert's weights. Raises ``ValueError`` as :func:`counted_reliabilities`.
     """
     mdp, discount, n_features = setting.mdp, float(setting.mdp.discount), setting.mdp.n_features
     noise, expert = noise_of(setting), expert_of(mdp, setting.weights)
@@ -199,10 +199,10 @@ def posterior_change(
 ) -> list[Coverage]:
     """Check the proof's step from the true model to one within ``epsilon_o`` of it, for every observation.
 
-    Reliabilities are off by ``epsilon_o`` to a random side. What is seen is the largest change of a feature's
-    ``(1 - gamma) phi_hat`` between the two posteriors, over ``size`` trajectories of a run and of its worst
-    trajectory alone; it is held to ``L |Psi| epsilon_o`` and to the bound by odds (:func:`.model_distance`),
-    both surely. Any :class:`~i2rl.models.FeatureNoise` will do. Raises ``ValueError`` for reliabilities
+    Reliabilities are off by ``epsilon_o`` to a random side. The result is the largest change of a feature's
+    ``(1 - gamma) phi_hat`` between the two posteriors, over ``size`` trajectories of a replication and of its
+    worst trajectory alone, against ``L |Psi| epsilon_o`` and the bound by odds (:func:`.model_distance`),
+    both sure. Every :class:`~i2rl.models.FeatureNoise` is allowed. Raises ``ValueError`` for reliabilities
     within ``epsilon_o`` of 0 or 1.
     """
     mdp, unit = setting.mdp, 1 - float(setting.mdp.discount)

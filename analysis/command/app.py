@@ -20,16 +20,16 @@ from .learn import learn_online
 from .show import show_journal
 
 BROKEN_PIPE = 128 + 13
-"""Exit status of a command whose reader went away, as the shell gives it to one that SIGPIPE ends."""
+"""Exit status of a command whose reader went away, the shell's for SIGPIPE."""
 
 
 class _Commands(TyperGroup):
-    """Commands that end quietly, as other tools do, when the reader of their output (``head``) goes away."""
+    """Commands that end quietly when the reader of their output (``head``) goes away."""
 
     def invoke(self, ctx: Any) -> Any:
         try:
             result = super().invoke(ctx)
-            sys.stdout.flush()  # not left to the interpreter's exit, which would complain
+            sys.stdout.flush()  # the interpreter's exit would print an error
             return result
         except BrokenPipeError:
             os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
@@ -38,7 +38,7 @@ class _Commands(TyperGroup):
 
 app = typer.Typer(
     cls=_Commands,
-    help="Learn why somebody acts as they do, while they are still acting, from imperfect observations.",
+    help="Learn the reward behind a behaviour online, from imperfect observations.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
@@ -69,7 +69,7 @@ def _options(
 
 
 def _interrupt_again(unraisable: Any) -> None:
-    """Raise Ctrl-C once more where Python swallowed it: in JAX's callback of the garbage collector."""
+    """Raise Ctrl-C once more after Python swallowed it in JAX's callback of the garbage collector."""
     if unraisable.exc_type is KeyboardInterrupt:
         main_thread = threading.main_thread().ident
         threading.Timer(0.01, signal.pthread_kill, (main_thread, signal.SIGINT)).start()

@@ -17,9 +17,9 @@ def print_bounds(
     epsilon: Annotated[
         float, real_option("Error of a feature's discounted average, below 1.", 1e-9, 1)
     ] = 0.1,
-    confidence: Annotated[float, real_option("Probability with which the bound is to hold.", 0, 1)] = 0.8,
+    confidence: Annotated[float, real_option("Probability with which the bound holds.", 0, 1)] = 0.8,
     epsilon_s: Annotated[float, real_option("Error of sampling the hidden steps, below 1.", 1e-9, 1)] = 0.05,
-    discount: Annotated[float | None, real_option("Discount, below 1; 0.99 unless --mdp says.", 0, 1)] = None,
+    discount: Annotated[float | None, real_option("Discount, below 1; 0.99 without --mdp.", 0, 1)] = None,
     deviation: Annotated[
         float | None, real_option("Standard deviation of the features' discounted averages.", 0, 0.5)
     ] = None,
@@ -27,12 +27,12 @@ def print_bounds(
         str | None, typer.Option(help="patrol1, patrol2 or patrol3: its features, discount and spread.")
     ] = None,
     predicates: Annotated[
-        int | None, count_option("Predicates whose reliabilities noisy perception is described by.")
+        int | None, count_option("Predicates whose reliabilities describe noisy perception.")
     ] = None,
     steps: Annotated[int | None, count_option("Steps of a trajectory, with --predicates.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Say how many demonstrations are enough: by the theorem, by tighter bounds, and what is assumed."""
+    """Compute how many demonstrations are enough, by the theorem and by tighter bounds, with all assumptions."""
     from ..bounds import sample_sizes as bounds_answer
 
     with reported_errors():

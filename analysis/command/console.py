@@ -20,7 +20,7 @@ LONGEST_MESSAGE = 1000
 
 
 def print_results(teller: Any, study: Any, folder: Path, as_json: bool) -> None:
-    """Print a study's results: those of its page's ``results.json``, or its tables and where the page is."""
+    """Print a study's results: its page's ``results.json``, or its tables and the path of its page."""
     from ..drawing.text import printable
 
     if as_json:
@@ -32,7 +32,7 @@ def print_results(teller: Any, study: Any, folder: Path, as_json: bool) -> None:
 
 @contextmanager
 def reported_errors() -> Iterator[None]:
-    """Mistakes in what was given end with one clear line, not a traceback."""
+    """End with one clear line, without a traceback, for faulty input."""
     from ...inference.journal.journal import JournalError
     from ...inference.programs.constraints import ProgramNotSolved
 
@@ -79,12 +79,12 @@ def progress(quiet: bool) -> Iterator[Any]:
 
 
 def output_console() -> Console:
-    """Tables fit the terminal, and are not squeezed where there is none."""
+    """Make a console as wide as the terminal, or 120 columns without one."""
     from rich.console import Console
 
     class Output(Console):
         def on_broken_pipe(self) -> None:
-            raise BrokenPipeError  # where Rich would end the process
+            raise BrokenPipeError  # Rich would end the process
 
     return Output(width=None if sys.stdout.isatty() else 120)
 

@@ -22,9 +22,7 @@ def learn_online(
     demonstrations: Annotated[
         str, typer.Option(help="JSON Lines file of trajectories, or - for standard input.")
     ],
-    journal: Annotated[
-        Path, typer.Option(help="SQLite file that keeps every session; resumed if it exists.")
-    ],
+    journal: Annotated[Path, typer.Option(help="SQLite file of every session; resumed if it exists.")],
     observability: Annotated[
         int | None,
         count_option("Percent in view, for the patrols; a file's in_view array otherwise.", 0, 100),
@@ -32,16 +30,16 @@ def learn_online(
     session_size: Annotated[int, count_option("Trajectories a session.")] = 1,
     agent: Annotated[int | None, typer.Option(help="Learn from this agent's lines only.")] = None,
     statistic: Annotated[
-        str, typer.Option(help="What is kept of a session: seen, counts or features.")
+        str, typer.Option(help="Statistic of a session in the state: seen, counts or features.")
     ] = "seen",
     solver: Annotated[str, typer.Option(help="newton, ipopt, cvxpy or 'exponentiated gradient'.")] = "newton",
     slack: Annotated[float | None, real_option("L1 slack, nats per trajectory.", 0)] = None,
     ridge: Annotated[float, real_option("Precision of a Gaussian prior on the weights.", 0)] = 0.0,
     follow: Annotated[
-        bool, typer.Option("--follow", help="Keep waiting for new lines, also when the file is rotated.")
+        bool, typer.Option("--follow", help="Wait for new lines, also after the file is rotated.")
     ] = False,
     quarantine: Annotated[
-        Path | None, typer.Option(help="Set bad lines aside in this file, with reasons, and go on past them.")
+        Path | None, typer.Option(help="Move bad lines to this file, with reasons, and continue.")
     ] = None,
     line_bytes: Annotated[int, count_option("Most bytes of a line; a longer one is bad.", most=2**40)] = 4
     * 2**20,
@@ -49,11 +47,11 @@ def learn_online(
     seed: Annotated[int, seed_option("Seed of the first weights; ignored when resuming.")] = 0,
     as_json: Json = False,
 ) -> None:
-    """Learn online from a stream of trajectories; safe to interrupt, and to run again.
+    """Learn online from a stream of trajectories; interrupt and resume at any time.
 
-    Every session is on disk before the next begins. Run the same command again and it goes on where it
-    stopped, to the bit. It checks that the input begins with the lines that it learned from: of a file that
-    was rotated, give all parts one after the other, on standard input.
+    Every session is on disk before the next begins. Run the same command again to resume, identical to the
+    bit. The command checks that the input begins with the lines that it learned from: give all parts of a
+    rotated file, one after the other, on standard input.
     """
     import jax
 

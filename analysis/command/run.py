@@ -12,7 +12,7 @@ from .console import print_results, progress, reported_errors
 from .options import Instance, Json, Percent, Seed, count_option, real_option
 
 commands = typer.Typer(
-    help="Do a whole study: learn, evaluate, and write a report with pictures.", no_args_is_help=True
+    help="Run a whole study: learn, evaluate, and write a page with pictures.", no_args_is_help=True
 )
 
 
@@ -44,7 +44,7 @@ class NoisyStarts(StrEnum):
 
 
 class Domain(StrEnum):
-    """Tasks that ``run robust-airl`` knows."""
+    """Tasks of ``run robust-airl``."""
 
     patrol = "patrol"
     mountain_car = "mountain-car"
@@ -66,7 +66,7 @@ def run_patrol(
     folder: Annotated[Path, typer.Option(help="Folder of the page and its results.")] = Path("report"),
     as_json: Json = False,
 ) -> None:
-    """Watch patrollers through a keyhole, learn their reward online, and walk past them unseen."""
+    """Watch patrollers through a keyhole, learn their reward online, and walk past them undetected."""
     from ..studies.patrol import study as patrol_study
 
     with reported_errors(), progress(as_json) as advance:
@@ -99,7 +99,7 @@ def run_labyrinth(
     ),
     as_json: Json = False,
 ) -> None:
-    """Learn a mouse's reward in a labyrinth, bout by bout, each bout predicted before it is learned from."""
+    """Learn a mouse's reward in a labyrinth, bout by bout; predict each bout before learning from it."""
     from ...domains.labyrinth.process import read_bouts
     from ..studies.labyrinth import page as labyrinth_page
     from ..studies.labyrinth import study as labyrinth
@@ -130,7 +130,7 @@ def run_methods(
     ),
     as_json: Json = False,
 ) -> None:
-    """Compare online methods on a patrol in full view: how many pairs does each need, what does it keep?"""
+    """Compare online methods on a patrol in full view: the pairs that each needs, and its memory."""
     from ..studies.methods import study as online_methods
 
     with reported_errors(), progress(as_json) as advance:
@@ -164,7 +164,7 @@ def run_label_bias(
 
 @commands.command("sorting")
 def run_sorting(
-    tasks: Annotated[int, count_option("Ways of sorting demonstrated, 2 or 3.", 2, 3)] = 2,
+    tasks: Annotated[int, count_option("Behaviours demonstrated, 2 or 3.", 2, 3)] = 2,
     trajectories: Annotated[
         str | None,
         typer.Option(
@@ -177,7 +177,9 @@ def run_sorting(
         int | None,
         count_option("Sessions of the online learner; they end at the numbers above unless given."),
     ] = None,
-    n_components: Annotated[int, count_option("Ways that MME-MTIRL starts from: the most it can find.")] = 4,
+    n_components: Annotated[
+        int, count_option("Components that MME-MTIRL starts with: the most it can find.")
+    ] = 4,
     steps: Annotated[int, count_option("Steps of a trajectory.")] = 50,
     replications: Annotated[int, count_option("Independent repetitions.")] = 3,
     belts: Annotated[int, count_option("Simulated belts of Table 7.2.")] = 300,
@@ -187,7 +189,9 @@ def run_sorting(
     ),
     as_json: Json = False,
 ) -> None:
-    """Learn several ways of sorting onions from one jumble: how many there are, who did what, and why."""
+    """Learn the rewards of several ways to sort onions, their number and their trajectories, from mixed
+    demonstrations.
+    """
     from ..studies.sorting import page as sorting_page
     from ..studies.sorting import study as sorting_study
 
@@ -225,7 +229,9 @@ def run_robust_airl(
     ),
     as_json: Json = False,
 ) -> None:
-    """Learn rewards as networks from noisy reports: AIRL, robust-AIRL and SSRR, judged by the true reward."""
+    """Learn rewards as networks from noisy observations by AIRL, robust-AIRL and SSRR; judge them by the true
+    reward.
+    """
     from ..studies.adversarial import running as robust_airl
 
     with reported_errors(), progress(as_json) as advance:
@@ -256,7 +262,7 @@ def run_noisy_sorting(
     ),
     as_json: Json = False,
 ) -> None:
-    """Learn to sort onions from reports that may be wrong, and how often they are."""
+    """Learn to sort onions from noisy observations, and the noise."""
     _run_noisy("sorting", replications, sessions, starts, seed, folder, as_json, belts=belts)
 
 
@@ -271,7 +277,7 @@ def run_noisy_patrol(
     ),
     as_json: Json = False,
 ) -> None:
-    """Learn a patroller's reward from reports that may be wrong, also where most of it is out of view."""
+    """Learn a patroller's reward from noisy observations, also with most of the patrol out of view."""
     _run_noisy("patrol", replications, sessions, starts, seed, folder, as_json)
 
 

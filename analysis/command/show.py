@@ -27,9 +27,9 @@ def show_journal(
     ] = False,
     as_json: Json = False,
 ) -> None:
-    """Show what a journal holds; works while a learner is writing it.
+    """Show a journal's content, also while a learner writes it.
 
-    Sessions that are shown are checked against their digests, and no others are read.
+    Only the sessions shown are read; each is checked against its digest.
     """
     from ...inference.journal.journal import Journal
 

@@ -21,7 +21,7 @@ def simulate_patrol(
     steps: Annotated[int, count_option("Steps of a trajectory.")] = 5,
     seed: Seed = 0,
 ) -> None:
-    """Write what a learner sees of the patrollers, one trajectory a line, to standard output."""
+    """Write a learner's observations of the patrollers, one trajectory a line, to standard output."""
     import jax
 
     from ...domains.patrol.process import demonstrate

@@ -83,10 +83,10 @@ def _is_rewritten(file: FileIO, tail: bytes) -> bool:
 def read_lines(
     pieces: Iterable[bytes], source: str, limits: LineLimits = DEFAULT_LIMITS, *, skip: bool = False
 ) -> Iterator[Line]:
-    """Put lines together from pieces that end where lines do, if not before.
+    """Join pieces to lines; a piece ends at the end of a line or before it.
 
-    No more than ``limits.size`` of a line are kept; with ``skip`` a longer one comes out with a fault,
-    otherwise :class:`DemonstrationError` is raised as soon as it is too long.
+    A line has at most ``limits.size`` bytes; a longer one comes out with a fault with ``skip``, otherwise it
+    raises :class:`DemonstrationError`.
     """
     line = _Unfinished(Position())
     for piece in pieces:
@@ -144,10 +144,10 @@ def open_lines(
     skip: bool = False,
     say: Callable[[str], None] | None = None,
 ) -> tuple[Iterator[Line], str]:
-    """Lines of a file, or of standard input for ``-``, and the name to call it in messages.
+    """Open a file, or standard input for ``-``; return its lines and its name in messages.
 
-    ``say`` takes what there is to tell of a file that is followed; by default it goes to standard error.
-    Raises ``OSError``; the lines are as :func:`read_lines` gives them.
+    ``say`` receives messages about a followed file; the default prints to standard error. Raises ``OSError``;
+    the lines are as :func:`read_lines` gives them.
     """
     say = partial(print, file=sys.stderr) if say is None else say
     if path == "-":
@@ -236,7 +236,7 @@ def learn_stream(
         try:
             state, report = learner.update(state, demonstration)
         except ValueError as error:
-            # The learner counts trajectories within a session; a person looks for lines.
+            # The learner counts trajectories within a session; people count lines.
             numbers = [record.line for _, record in collected]
             place = f"line {numbers[0]}" if len(numbers) == 1 else f"session of lines {_listed(numbers)}"
             told = f"{source}, {place}: {error}"

@@ -34,7 +34,7 @@ class Theme(NamedTuple):
 
     ``surface`` is the page, ``ink`` text and lines, ``muted`` secondary text, ``grid`` rules. ``cell`` and
     ``view`` fill a floor map's cells, out of and in the learner's view; ``match`` and ``mismatch`` say
-    whether something agrees with the expert. ``series`` colours methods, told apart by marker and dashes
+    whether something agrees with the expert. ``series`` colours methods, which differ in marker and dashes
     too; ``heat`` runs from the page to the colour of certainty, ``signed`` from the negative over zero to the
     positive.
     """
@@ -113,7 +113,7 @@ DASHES: tuple[Any, ...] = (
 def series_style(theme: Theme, i: int) -> dict[str, Any]:
     """Colour, marker and dashes of the ``i``-th chain, bound or rule; repeats after eight.
 
-    Methods have a look of their own in every figure: see :func:`method_styles`.
+    Methods have their own style in every figure: see :func:`method_styles`.
     """
     return _look(theme, i, i, i)
 
@@ -231,7 +231,8 @@ _SAME = {
 def method_styles(theme: Theme, names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Colour, marker and dashes of every method of a figure, by its name.
 
-    A method of this library looks the same in every figure. Others take what is left, in their order.
+    A method of this library has the same style in every figure. Others take the remaining styles, in their
+    order.
     """
     names = list(dict.fromkeys(names))
     looks = {

@@ -32,8 +32,8 @@ from ...models.process.planning import (
 class Accuracy(NamedTuple):
     """Learned behaviour accuracy (LBA): a share in [0, 1] of all states, and of the choice states.
 
-    A *choice state* has more than one available action; elsewhere nothing can be done wrong. Where every
-    state is one (all patrol instances) the two shares are equal; where none is, ``choice`` is NaN.
+    A *choice state* has more than one available action; elsewhere no error is possible. If every state is one
+    (all patrol instances) the two shares are equal; without any, ``choice`` is NaN.
     """
 
     overall: Float[Array, ""]
@@ -94,10 +94,11 @@ def policy_error(
 def learned_behavior_accuracy(
     mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
 ) -> Accuracy:
-    """LBA: share of states where the learned greedy action is one of the expert's optimal actions.
+    """Compute LBA: the share of states where the learned greedy action is one of the expert's optimal
+    actions.
 
-    The learner commits to one action per state, as in :func:`greedy_policy` (so a reward that says nothing
-    is not credited with every action); the expert's ties all count. Source: section 7.2. Errors as there.
+    The learner commits to one action per state, as in :func:`greedy_policy` (so a constant reward is not
+    credited with every action); the expert's ties all count. Source: section 7.2. Errors as there.
     """
     return evaluate(mdp, true_weights, learned_weights).accuracy
 
@@ -105,10 +106,9 @@ def learned_behavior_accuracy(
 def chance_accuracy(
     key: Array, mdp: TabularMDP, true_weights: Float[Array, " K"], draws: int = 200
 ) -> Float[np.ndarray, " draws"]:
-    """LBA of weights that nobody learned, drawn uniformly from ``[-0.99, 0.99]^K``.
+    """Compute LBA of random weights, uniform on ``[-0.99, 0.99]^K``.
 
-    An accuracy that many of them reach is no sign that anything was learned. Errors as for
-    :func:`greedy_policy`.
+    An accuracy that many of them reach does not prove learning. Errors as for :func:`greedy_policy`.
     """
     drawn = jax.random.uniform(key, (draws, mdp.n_features), float, -0.99, 0.99)
     return np.asarray(behaviour_accuracies(mdp, optimal_actions(mdp, true_weights), drawn))

@@ -1,7 +1,7 @@
 """Quality of a reward and a policy of networks (section 7.4.3): returns, correlations, LBA, empirical ILE.
 
-Where there is no table of states everything is estimated from episodes, so every number comes with the
-distribution it was taken over, its count and an interval. Shares are in [0, 1].
+Without a table of states all measures are estimated from episodes, so every number comes with its
+distribution, its count and an interval. Shares are in [0, 1].
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ def returns_at_fixed_length(
     *,
     deterministic: bool = False,
 ) -> Float[np.ndarray, " episodes"]:
-    """Undiscounted returns, by the environment's own reward, of episodes of ``length`` steps.
+    """Simulate undiscounted returns, by the environment's own reward, of episodes of ``length`` steps.
 
-    An episode that terminates earns nothing more; where the length is not to depend on the policy (Table
-    7.3), the environment must not terminate: ``locomotion(name, terminate_when_unhealthy=False)``.
+    An episode earns zero after it terminates; to make the length independent of the policy (Table 7.3), use
+    an environment that does not terminate: ``locomotion(name, terminate_when_unhealthy=False)``.
     """
     return simulate(environment, policy, key, episodes, length, deterministic=deterministic).returns
 
@@ -211,16 +211,17 @@ def action_agreement(space: ActionSpace, expert: np.ndarray, learner: np.ndarray
 def behaviour_accuracy(
     space: ActionSpace, expert: Behaviour, learner: Behaviour, observations: Float[np.ndarray, "N d"]
 ) -> float:
-    """LBA (section 7.4.3): mean agreement of both policies' deterministic actions in the given states.
+    """Compute LBA (section 7.4.3): mean agreement of both policies' deterministic actions in the given
+    states.
 
-    The dissertation's is 100 times this. No offset, no sampled actions; the states are the caller's to state.
+    The dissertation's is 100 times this. Actions are exact modes; the caller chooses the states.
     """
     seen = jnp.asarray(observations, jnp.float32)
     ours, theirs = (np.asarray(acted(p, _NO_KEY, seen, True)) for p in (learner, expert))
     return float(action_agreement(space, theirs, ours).mean())
 
 
-# The mode draws nothing.
+# The mode needs no draw.
 _NO_KEY = jnp.zeros(2, jnp.uint32)
 
 
@@ -378,10 +379,11 @@ def recovered_share(
 ) -> Recovery:
     """Estimate the share of the return (or LBA) lost to noise that a robust learner recovers.
 
-    Entry ``i`` of all three is of the same seed, and seeds are drawn together. Where noise may have cost
-    nothing, the ratio has a pole: means without a loss, of the replications or of a resample, count as minus
-    or plus infinity by what the robust learner gained. Of a few replications a bootstrap's interval is too
-    narrow. Raises ``ValueError`` for different numbers of replications, none, or numbers that are not finite.
+    A bootstrap over replications gives the interval: entry ``i`` of all three has one seed, and the three are
+    drawn together. If noise may have no cost, the ratio has a pole: means without a loss, of the replications
+    or of a resample, count as minus or plus infinity by what the robust learner gained. Of a few replications
+    a bootstrap's interval is too narrow. Raises ``ValueError`` for different numbers of replications, none,
+    or numbers that are not finite.
     """
     replications = [np.asarray(x, float) for x in (clean, noisy, robust)]
     n = len(replications[0])

@@ -1,8 +1,8 @@
-"""Execute the notebooks from a clean start, and save them without what only this machine and moment know.
+"""Execute the notebooks from a clean start, and save them without machine and time.
 
 ``python -m i2rl.analysis.notebooks.execute`` executes all of them in place, at the sizes they are published
 with; paths as arguments choose some. The cell tagged ``parameters`` (papermill's convention) holds a
-notebook's sizes: whoever executes one may set others, as the tests do, and they are injected after it.
+notebook's sizes: an execution may set others, as the tests do; they are injected after it.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def execute_notebook(
             kernel_name="python3",
             kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),
             connection_file=os.path.join(folder, "connection.json"),
-            # A socket in a private folder: nobody else can listen, which the kernel would warn of.
+            # A socket in a private folder: other users cannot listen, which the kernel would warn of.
             transport="tcp" if sys.platform == "win32" else "ipc",
         )
         work = Path(folder, "work")

@@ -111,7 +111,7 @@ def weights_by_session(
 def forest_plot(
     idata: az.InferenceData, *, coverage: float = 0.9, theme: Theme = LIGHT, title: str = ""
 ) -> Figure:
-    """Each weight: all draws together, and below them every chain on its own, which should look alike.
+    """Draw each weight: all draws together, and below them every chain on its own; chains should agree.
 
     Points are medians, thick bars hold the middle half of the draws, thin ones the middle ``coverage``.
     """
@@ -225,7 +225,7 @@ def rank_plot(idata: az.InferenceData, *, bins: int = 20, theme: Theme = LIGHT, 
         ranks = stats.rankdata(weights.isel(feature=k).values).reshape(chains, draws)
         axes.axhspan(low, high, color=theme.cell, linewidth=0)
         axes.axhline(draws / bins, color=theme.muted, linewidth=0.9)
-        # Twice the expected count at least, so that a panel in which all is well looks so.
+        # Twice the expected count at least, so that a panel of a good fit is flat.
         highest = 2 * draws / bins
         for c in range(chains):
             style = series_style(theme, c)

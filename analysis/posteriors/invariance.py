@@ -1,9 +1,10 @@
-"""Changes of a reward that leave behaviour alone, found by linear algebra and named.
+"""Changes of a reward that leave behaviour unchanged, found by linear algebra and named.
 
-A direction ``d`` of weight space changes no soft policy on a closed set of states if and only if
-``d.phi(s, a) = h(s) - gamma E[h(s')]`` there for some potential ``h`` (Ng, Harada and Russell 1999): one
-sense follows by differentiating the soft Bellman equations, the other by putting ``V + h`` into them. Zero
-and constant ``d.phi`` are the simplest cases. What holds at some weights therefore holds at all.
+A direction ``d`` of weight space changes no soft policy on a closed set of states if and only if ``d.phi(s,
+a) = h(s) - gamma E[h(s')]`` there for some potential ``h`` (Ng, Harada and Russell 1999): one sense follows
+by differentiating the soft Bellman equations, the other by putting ``V + h`` into them. Zero and constant
+``d.phi`` are the simplest cases. A direction that changes no policy at some weights therefore changes none at
+all weights.
 """
 
 from __future__ import annotations
@@ -64,9 +65,9 @@ class Direction(NamedTuple):
 def unidentified_directions(
     mdp: TabularMDP, shown: Bool[np.ndarray, " S"] | None = None
 ) -> tuple[Direction, ...]:
-    """Directions that change no policy at any state a trajectory can get to, in sparse, named form.
+    """Find the directions that change no policy at any reachable state, in sparse, named form.
 
-    A complete basis of them: every other such direction is a sum of these. Each is named by the simplest
+    They are a complete basis: every other such direction is a sum of these. Each is named by the simplest
     reason that holds: never active, duplicate, collinear, constant, potential shaping, not visited.
 
     Parameters
@@ -74,8 +75,8 @@ def unidentified_directions(
     mdp : TabularMDP
         With discount below 1.
     shown : bool ``[S]``, optional
-        States where the demonstrations may have been. Directions that matter only where none of the ways
-        onward from those lead are *not visited*.
+        States where the demonstrations may have been. Directions that matter only at states unreachable from
+        those are *not visited*.
 
     Raises
     ------

@@ -119,7 +119,7 @@ def _replicate(
 
         codes = jax.vmap(perceive)(jax.random.split(key, n))
         seen = counted & (codes[..., 0] == SEEN)
-        # Out of range, and so dropped, where nothing is counted.
+        # Out of range, and so dropped, at steps that are not counted.
         place = jnp.where(seen, codes[..., 1], mdp.n_states)
         visits = jnp.zeros(mdp.n_states, int).at[place].add(1, mode="drop")
         return visits, _expected_visits(mdp, plan.policy, sensor, jnp.sum(counted, 0))
