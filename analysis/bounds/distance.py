@@ -79,7 +79,7 @@ class ModelDistance(NamedTuple):
     odds: float
 
     def over(self, steps: int) -> tuple[float, float]:
-        """Bound the total variation of a trajectory's observations, and of the posterior over trajectories."""
+        """Bound the total variation of a trajectory's observations, and that of the posterior."""
         counted("steps", steps)
         return _over_steps(self.variation, steps), math.tanh(steps * self.odds / 4)
 

@@ -1,23 +1,22 @@
 """Average regret of an online learner (Definition 8) with constant and with diminishing thresholds.
 
-The log-likelihood given away in a session comes in two honest forms, both in nats per trajectory:
+A session's loss of log-likelihood has two forms, both in nats per trajectory:
 
 empirical
-    ``LL(theta_E | X_{1:i}) - LL(theta^i | X_{1:i})`` on the learner's own statistic, chapter 4's. The
-    learner fits that data, so this is usually negative; where its program is convex and solved (the
-    ``features`` statistic of whole, fully observed trajectories) it is surely at most ``sum_k beta_k
-    |theta_E,k|``, with no probability involved.
+    ``LL(theta_E | X_{1:i}) - LL(theta^i | X_{1:i})`` on the learner's own statistic, chapter 4's. The learner
+    fits that data, so this is usually negative; if its program is convex and solved (the ``features``
+    statistic of whole, fully observed trajectories) it is surely at most ``sum_k beta_k |theta_E,k|``, with
+    no probability involved.
 expected
-    The same difference under the expert's own law: the excess risk of ``theta^i``. By Gibbs' inequality it
-    is never negative, and it is what a regret should be: what the learner's estimate costs on fresh data.
-    It equals ``sum_s d(s) KL(pi_E(.|s) || pi_theta(.|s))``, with ``d`` the expert's visits: discounted
-    ones for ``features``, those of one trajectory for ``counts``, and of them those in view for ``seen``.
+    The same difference under the expert's own law: the excess risk of ``theta^i``. By Gibbs' inequality it is
+    at least zero, and it is the regret proper: the cost of the learner's estimate on fresh data. It equals
+    ``sum_s d(s) KL(pi_E(.|s) || pi_theta(.|s))``, with ``d`` the expert's visits: discounted ones for
+    ``features``, those of one trajectory for ``counts``, and of them those in view for ``seen``.
 
 Theorem 5 (Theorem 3 of chapter 4) is about the expected form: it promises ``O(log T) / T`` for thresholds
 ``epsilon_i / (1 - gamma) = c / i`` with probability ``prod_i max(0, 1 - delta_i)``. With a fixed number of
-trajectories a session that probability is 0 from some session on, see :func:`last_confident_session`; what
-is left without a condition is the sure bound of the empirical form. What is measured here is the regret
-itself, not its bound.
+trajectories a session that probability is 0 from some session on, see :func:`last_confident_session`; only
+the sure bound of the empirical form is unconditional. This module measures the regret itself, not its bound.
 """
 
 from __future__ import annotations

@@ -18,12 +18,11 @@ _SYMBOLS = {True: "holds", False: "does not hold", None: "yours to answer for"}
 
 
 class Answer(NamedTuple):
-    """Trajectories by bound for one ``confidence``, the theorem's bound at its own number of them, and what
-    knowing nothing achieves.
+    """Numbers of trajectories by bound for one ``confidence``, and the error of ignorance.
 
-    Where the expert is known, ``ignorance_nats`` is the expected log-likelihood gap of zero weights, and
-    ``informative`` the trajectories from which on each bound promises less than that. ``perception`` is what
-    the same error takes under noisy perception (:func:`.perception_needed`), where that was asked for.
+    For a known expert, ``ignorance_nats`` is the expected log-likelihood gap of zero weights, and
+    ``informative`` the trajectories from which on each bound promises less than that. ``perception`` is the
+    data for the same error under noisy perception (:func:`.perception_needed`), if requested.
     """
 
     confidence: float

@@ -1,11 +1,10 @@
-"""Stopping rules compared: how often they stop too soon, and how many sessions they save.
+"""Comparison of stopping rules: their false stops and the sessions that they save.
 
-A *false stop* is judged by what the learner has learned, never by the quantity that a rule looks at, so that
-all rules are judged alike: stopping a stream after session ``i`` is false if the learned behaviour's accuracy
-there is worse, by more than ``margin``, than what the same stream settles at, the mean accuracy of its last
-``tail`` sessions. (One last session would be a noisy yardstick, the best one a lucky one.) The accuracy is
-LBA, which needs the expert: it judges rules, and no rule sees it. A rule that never fires within the
-stream has made no false stop, and has saved nothing.
+The learned behaviour judges a *false stop*, never the quantity of a rule, so that all rules are judged alike:
+a stop after session ``i`` is false if the learned behaviour's accuracy there is worse, by more than
+``margin``, than the stream's mean accuracy of its last ``tail`` sessions. (One last session would be a noisy
+yardstick, the best one a lucky one.) The accuracy is LBA, which needs the expert: it judges rules, and is
+hidden from them. A rule that never fires within the stream makes no false stop and saves zero sessions.
 
 The rules themselves are those of :mod:`i2rl.inference.sessions.stopping`; here each is applied to all streams
 at once.

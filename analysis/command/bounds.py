@@ -32,7 +32,7 @@ def print_bounds(
     steps: Annotated[int | None, count_option("Steps of a trajectory, with --predicates.")] = None,
     as_json: Json = False,
 ) -> None:
-    """Compute how many demonstrations are enough, by the theorem and by tighter bounds, with all assumptions."""
+    """Compute how many demonstrations are enough, by the theorem and tighter bounds; list the assumptions."""
     from ..bounds import sample_sizes as bounds_answer
 
     with reported_errors():

@@ -170,7 +170,7 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
                 markeredgewidth=1.5,
             )
     dress(axes, theme, x="share of what noise cost that is won back", grid="x")
-    # A domain's second row is told by its colour alone.
+    # Only its colour marks a domain's second row.
     names = [
         "" if i and r is rows[i - 1][0] else f"{r.title}: {MEASURED[r.measure]}"
         for i, (r, _, _) in enumerate(rows)
@@ -295,7 +295,9 @@ def _told(found: Correlation) -> str:
 
 
 def belief_plot(belief: Belief, theme: Theme, title: str = "What happened, and what is believed") -> Figure:
-    """Components of a trajectory against time: reports, the truth, and the posterior's mean and band."""
+    """Draw a trajectory's components against time: observations, the truth, and the posterior's mean and
+    band.
+    """
     m = len(belief.names)
     columns = 1 if m < 3 else 2
     rows = -(-m // columns)

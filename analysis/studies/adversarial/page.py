@@ -1,6 +1,6 @@
-"""The study of adversarial learners told: tables beside the dissertation's, figures, and the report.
+"""Page of the study of adversarial learners: tables beside the dissertation's, and figures.
 
-:func:`write` takes what a study came to, one
+:func:`write` takes a study's results, one
 :class:`~i2rl.analysis.studies.adversarial.results.AdversarialResults` a domain.
 """
 
@@ -109,7 +109,7 @@ def recovery_table(results: AdversarialResults) -> Table:
         if results.domain in TABLE_7_3:
             table = TABLE_7_3[results.domain]
             printed = 1 - table[NOISY] / table[CLEAN]
-        lost = f"{round(1 - noisy.mean() / clean.mean(), 2) + 0.0:.0%}"  # nothing is not less than nothing
+        lost = f"{round(1 - noisy.mean() / clean.mean(), 2) + 0.0:.0%}"  # no bound below zero
         rows.append((f"{measure} lost to noise", lost, _NONE if printed is None else f"{printed:.0%}"))
         robust = results.late(ROBUST, results.measure)
         if robust is not None:
@@ -232,7 +232,7 @@ def _digits(returns: Any) -> int:
 
 
 def _percent_with_interval(shares: Float[np.ndarray, " replications"]) -> str:
-    """Student's interval of a few replications knows nothing of the ends of a scale."""
+    """Format Student's interval of a few replications, cut at the ends of the scale."""
     return _with_interval(shares, 100, within=(0, 100))
 
 

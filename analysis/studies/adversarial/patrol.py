@@ -1,13 +1,13 @@
-"""Adversarial learners on patrol through reports that err (section 7.4.3, Figure 7.11).
+"""Adversarial learners on patrol with noisy observations (section 7.4.3, Figure 7.11).
 
 Instance 2, its greedy expert (the dissertation's is a rule by hand), trajectories of 8 pairs from anywhere,
-sessions of 32 to 128 pairs. Moving forward is reported as turning left, and turning right as moving forward;
-states are never wrong. All is exact: the posterior of the truth behind a report, and the generator's plan.
+sessions of 32 to 128 pairs. Moving forward is observed as turning left, and turning right as moving forward;
+states are always right. The posterior of the truth behind an observation and the generator's plan are exact.
 
-:func:`patrol_results` is the study behind ``i2rl run robust-airl --domain patrol``. Networks alone are
-carried from session to session there, as in the dissertation (``memory`` of 0): with the statistic of earlier
-sessions that these learners keep by default, noise of 5 % costs next to nothing and there is nothing to
-recover. :mod:`~i2rl.analysis.benchmarks.statistics.adversarial_patrol` measures both.
+:func:`patrol_results` is the study behind ``i2rl run robust-airl --domain patrol``. Only networks pass from
+session to session there, as in the dissertation (``memory`` of 0): with the default statistic of earlier
+sessions, noise of 5 % costs almost nothing, which leaves nothing to recover.
+:mod:`~i2rl.analysis.benchmarks.statistics.adversarial_patrol` measures both.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ MISREPORT, POLICY = "probability of a misreport", "policy of robust-AIRL, first 
 
 
 class Streams(NamedTuple):
-    """The same sessions as they happened and as they were reported, ``[R, T, n, L]``; ``pairs [T]`` seen."""
+    """True and observed sessions, ``[R, T, n, L]``; ``pairs [T]`` seen."""
 
     truth: Demonstration
     seen: Demonstration
@@ -156,9 +156,10 @@ def outcome_of(patrol: Patrol, learner: Learner, streams: Demonstration, seed: i
 def success_rates(
     patrol: Patrol, policies: Float[np.ndarray, "R S A"], trials: int, seed: int = 2
 ) -> Float[np.ndarray, " R"]:
-    """Share of breaches that reach the goal unseen, with each run's policy for both patrollers.
+    """Compute the share of breaches that reach the goal undetected, with each replication's policy for both
+    patrollers.
 
-    Everything is in view and read rightly while the learner waits: what differs is the policy alone.
+    The learner observes everything exactly while it waits, so only the policies differ.
     """
     rates = []
     for i, policy in enumerate(policies):
@@ -202,7 +203,7 @@ def patrol_results(
     iterations: int = 30,
     advance: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> AdversarialResults:
-    """AIRL on the truth and on reports, and robust-AIRL with the sensor given or learned.
+    """Run AIRL on the truth and on observations, and robust-AIRL with the sensor given or learned.
 
     Parameters
     ----------
@@ -212,16 +213,17 @@ def patrol_results(
     noise : float
         Times the 5 % of both confusions.
     trials : int
-        Breaches tried with each learned policy.
+        Breaches simulated with each learned policy.
     iterations : int
         Of discriminator and generator in a session.
     advance : callable
-        Told what was done, and what share of all.
+        Called with a description and the share done.
 
     Raises
     ------
     ValueError
-        For fewer than one seed, session or trial, and for noise that makes no probability of the confusions.
+        For fewer than one replication, session or trial, and for noise that gives no probability of the
+        confusions.
     """
     sessions = SESSIONS if sessions is None else sessions
     for count, what in ((replications, "seed"), (sessions, "session"), (trials, "trial of a breach")):
@@ -229,7 +231,7 @@ def patrol_results(
             raise ValueError(f"there must be at least one {what}, got {count}")
     if not 0 < noise * LEVEL <= 1:
         raise ValueError(
-            f"noise multiplies the probability of {LEVEL:g} that a report errs, so that it is above 0 and at "
+            f"noise multiplies the probability of {LEVEL:g} that an observation errs, so that it is above 0 and at "
             f"most {1 / LEVEL:g}; got {noise}"
         )
     level, patrol = noise * LEVEL, instance(2)
@@ -262,8 +264,8 @@ def patrol_results(
     percent = f"{100 * level:.3g} %"
     return AdversarialResults(
         "patrol",
-        f"moving forward is reported as turning left, and turning right as moving forward, {percent} of the "
-        "time each; states are reported rightly",
+        f"moving forward is observed as turning left, and turning right as moving forward, {percent} of the "
+        "time each; states are observed correctly",
         replications,
         "",
         methods,
@@ -297,7 +299,7 @@ def _run(patrol: Patrol, learner: Learner, sessions: Demonstration, seed: int) -
 def believed_trajectories(results: AdversarialResults) -> Sequence[tuple[Strip, TabularMDP]]:
     """Complete a new trajectory with an error by robust-AIRL of the first replication, after learning.
 
-    None if no report errs in 64 sessions.
+    None if every observation is right in 64 sessions.
     """
     patrol, level = instance(2), results.settings[MISREPORT]
     streams = noisy_streams(patrol, level, replications=1, sessions=64, seed=1)

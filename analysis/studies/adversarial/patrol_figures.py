@@ -1,4 +1,4 @@
-"""Pictures of the patrol studies of adversarial learners: reports that err, and steps that are hidden.
+"""Figures of the patrol studies of adversarial learners: noisy observations and hidden steps.
 
 All draw the results of :mod:`i2rl.analysis.benchmarks.statistics.adversarial_patrol`.
 """
@@ -42,7 +42,7 @@ CLEAN, NOISY, ROBUST, LEARNED, LME = (
 )
 GAIL, ROBUST_GAIL = "online GAIL", "GAIL, hidden steps in expectation"
 LAST = 15
-# Section 7.4.3: success of AIRL and of robust-AIRL on noisy reports, 95 % ranges.
+# Section 7.4.3: success of AIRL and of robust-AIRL on noisy observations, 95 % ranges.
 PUBLISHED = {NOISY: (0.45, 0.53), ROBUST: (0.59, 0.66)}
 _MEMORY = {
     0.0: "Networks alone carried on, as in the dissertation",

@@ -1,10 +1,10 @@
 """Results of a study of adversarial learners, as plain arrays for figures and tables.
 
-How to fill it: one :class:`AdversarialResults` a domain; one :class:`MethodResult` a method, under its name
-from :data:`METHODS`, with one row a seed and one column a session. Seed ``i`` is the same for all methods.
-What a domain has no use for stays None or empty, and its figures and tables are left out. Everything can be
-stored and read again (:func:`store_results`, :func:`load_results`), so that a study may run on one machine
-and be told on another.
+Results have one :class:`AdversarialResults` a domain; one :class:`MethodResult` a method, under its name from
+:data:`METHODS`, with one row a replication and one column a session. Replication ``i`` has the same seed for
+all methods. Fields without use in a domain stay None or empty, and their figures and tables are left out.
+Results can be stored and loaded (:func:`store_results`, :func:`load_results`), so that a study may run on one
+machine and its page be written on another.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class RewardScatter(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """A noisy trajectory and what is believed of it; see :func:`belief_from_draws`.
+    """Noisy trajectory and its posterior; see :func:`belief_from_draws`.
 
     Fields
     ------

@@ -47,7 +47,7 @@ def answer(
 
 
 def write(results: AdversarialResults, folder: Path | str) -> Path:
-    """Write the report of one task; of patrol, what one learner believes of a trajectory besides."""
+    """Write the page of one task; patrol's also shows one learner's posterior of a trajectory."""
     if results.domain != "patrol":
         return write_study(results, folder)
     from .patrol import believed_trajectories

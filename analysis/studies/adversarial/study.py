@@ -1,10 +1,10 @@
-"""The study of adversarial learners under noisy perception: Tables 7.3 and 7.4, Figures 7.12 and 7.13.
+"""Study of adversarial learners under noisy perception: Tables 7.3 and 7.4, Figures 7.12 and 7.13.
 
-For each seed and method one online learner: in every session it is given one new demonstration and trains
-for the same number of environment steps. Methods differ in what they are given (the truth or reports) and in
-what they make of it. Every session is judged by what learning never sees: the true reward and the expert.
+Each replication and method has one online learner: every session it is given one new demonstration and trains
+for the same number of environment steps. Methods differ in their input (the truth or observations) and in
+their learner. The true reward and the expert, hidden from learning, judge every session.
 
-Runs are independent, so they may be shared out over processes and kept on disk one by one.
+Runs are independent, so processes may share them and store them on disk one by one.
 """
 
 from __future__ import annotations
@@ -59,11 +59,11 @@ STUDIED = (CLEAN, NOISY, ROBUST, LEARNED, SSRR)
 
 
 class Outcome(NamedTuple):
-    """One run.
+    """Result of one replication of a method.
 
     Fields
     ------
-    pairs, steps : int ``[T]``, reported pairs and environment steps after each session
+    pairs, steps : int ``[T]``, observed pairs and environment steps after each session
     returns, accuracy : float ``[T]``
     seconds : float ``[T]``
     scatter : RewardScatter
@@ -271,12 +271,12 @@ def adversarial_study(
 ) -> AdversarialResults:
     """Run all replications of all methods on one task.
 
-    Runs found in ``folder`` are not run again, and new ones are kept there. Raises ``ValueError`` for another
-    name than :data:`~i2rl.analysis.studies.adversarial.cases.PLANS` has, and for fewer than one seed or
-    session.
+    Finished runs in ``folder`` are loaded, and new ones are stored there. Raises ``ValueError`` for another
+    name than :data:`~i2rl.analysis.studies.adversarial.cases.PLANS` has, and for fewer than one replication
+    or session.
     """
     if replications < 1:
-        raise ValueError(f"there must be at least one seed, got {replications}")
+        raise ValueError(f"replications must be at least 1; got {replications}")
     of = case(name, plan)
     if of.plan.sessions < 1:
         raise ValueError(f"there must be at least one session, got {of.plan.sessions}")

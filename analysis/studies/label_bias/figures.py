@@ -49,12 +49,12 @@ def draw_world(study: LabelBiasStudy, theme: Theme) -> Figure:
     ]
     cells = np.array(world.cells)
     ranked = np.argsort(np.asarray(study.trajectories.reward), kind="stable")
-    # Evenly between the first and the last of those that differ: most of them earn nothing.
+    # Evenly between the first and the last of those that differ: most of them earn zero.
     _, distinct = np.unique(np.asarray(study.trajectories.reward)[ranked], return_index=True)
     chosen = ranked[distinct[np.unique(np.linspace(0, len(distinct) - 1, _PATHS).round().astype(int))]]
     for i, path in enumerate(chosen):
         states = np.asarray(study.trajectories.states[path])
-        # Side by side, so that ways through one cell stay apart.
+        # Side by side, so that paths through one cell stay apart.
         offset = (i - (_PATHS - 1) / 2) * 0.12
         style = series_style(theme, i)
         r, c = cells[states].T

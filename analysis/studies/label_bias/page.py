@@ -1,4 +1,4 @@
-"""The report on label bias: Table 5.1 beside the dissertation's, and where the correlation is significant."""
+"""Page on label bias: Table 5.1 beside the dissertation's, and its significance by setting."""
 
 from __future__ import annotations
 

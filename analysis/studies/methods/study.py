@@ -149,7 +149,7 @@ class _Entry(NamedTuple):
 def turning_places(patrol: Patrol) -> Bool[np.ndarray, " S"]:
     """Find where a patroller turns round: it turns, and turns again in the same cell.
 
-    The goals DARKO is told of, from the true policy: in its favour, for nobody else is told anything.
+    They are DARKO's goals, from the true policy: an advantage that the other methods do not have.
     """
     policy = patrol.expert_policy().argmax(1)
     turns = np.isin(policy, (LEFT, RIGHT))
@@ -282,10 +282,10 @@ def _accuracies(
 
 
 def draw(study: MethodsStudy, theme: Theme) -> Figure:
-    """Accuracy against state-action pairs seen (logarithmic): medians, and bands of the middle half.
+    """Draw accuracy against state-action pairs seen (logarithmic): medians, and bands of the middle half.
 
-    One panel a family of methods, since six bands cannot be told apart; the last method, this library's
-    default, is repeated in all of them as a thin line to compare with.
+    One panel a family of methods, since six bands would overlap; the last method, this library's default, is
+    repeated in all of them as a thin line to compare with.
     """
     figure = new_figure(theme, 9.6, 4.4)
     reference = study.curves[-1]

@@ -40,7 +40,7 @@ PUBLISHED = {
 
 
 class SensorPosterior(NamedTuple):
-    """Agreement of features: by NUTS, by RIMEO, truly, and as it happened to be.
+    """Agreement of features: by NUTS, by RIMEO, in truth, and in the data.
 
     Fields
     ------
@@ -48,9 +48,9 @@ class SensorPosterior(NamedTuple):
     draws : float ``[draws, J]``
     learned, truth : float ``[J]``
     happened : float ``[J]``
-        Share of the reports learned from that agree with what they are of.
+        Share of the observations learned from that agree with their truth.
     trajectories, divergences : int
-        That were learned from; divergent transitions of NUTS.
+        Trajectories learned from; divergent transitions of NUTS.
     reward : float ``[draws, K]`` or None
         Weights of the same draws.
     """

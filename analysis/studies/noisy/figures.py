@@ -65,7 +65,7 @@ def _draw_mean(
 ) -> None:
     """Draw a method's mean and its band, which ends at ``top`` and at a fifth of the mean.
 
-    The normal interval knows nothing of either end of a scale; a logarithmic one has no zero.
+    The normal interval ignores the ends of a scale; a logarithmic one has no zero.
     """
     style, band = method_styles(theme, [result.name])[result.name], mean_interval(replications)
     x = result.sessions
@@ -113,7 +113,7 @@ def _count_sessions(panel: Axes, sessions: int) -> None:
 
 
 def divergence_plot(study: NoisyStudy, theme: Theme) -> Figure:
-    """Divergence of the learned sensor against sessions, logarithmic: ways of learning it, and controls."""
+    """Draw the divergence of the learned sensor against sessions, logarithmic, for learners and controls."""
     groups = (
         ("RIMEO", (PLAIN, AVERAGED, STEPWISE, BARE)),
         ("Controls", (ORACLE, OBSERVED, FAIR, CODED, ALL)),
@@ -240,7 +240,7 @@ def sensor_plot(posterior: SensorPosterior, theme: Theme) -> Figure:
         color=theme.ink,
         clip_on=False,
     )
-    dress(axes, theme, x="probability that a report agrees with the truth", grid="x")
+    dress(axes, theme, x="probability that an observation agrees with the truth", grid="x")
     name_ticks(axes, "y", y, posterior.names, fontsize=TEXT)
     axes.set_ylim(n - 0.4, -0.6)
     least = np.min([band.low, posterior.truth, posterior.learned, posterior.happened])
@@ -284,7 +284,7 @@ def sensor_plot(posterior: SensorPosterior, theme: Theme) -> Figure:
             linestyle="",
             markersize=6,
             markeredgewidth=1.6,
-            label="share of these reports",
+            label="share of these observations",
         ),
     ]
     head(figure, theme, handles, title="How reliable each feature is thought to be", columns=2)

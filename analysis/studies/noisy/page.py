@@ -1,4 +1,4 @@
-"""The study of noisy perception told: tables, figures, and the report that ``i2rl run noisy-...`` writes."""
+"""Page of the study of noisy perception, which ``i2rl run noisy-...`` writes: tables and figures."""
 
 from __future__ import annotations
 

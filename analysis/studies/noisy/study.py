@@ -1,8 +1,8 @@
-"""Learning through noisy perception, measured (section 7.4.3): the sensor that is learned, and the behaviour.
+"""Study of learning through noisy perception (section 7.4.3): the learned sensor and behaviour.
 
-Every method learns from the same simulated reports, many streams of them; learners that compile run all their
-streams in one program. The sensor is judged by agreement probabilities, the behaviour by learned behaviour
-accuracy (LBA).
+Every method learns from the same simulated observations, many streams of them; learners that compile run all
+their streams in one program. The sensor is judged by agreement probabilities, the behaviour by learned
+behaviour accuracy (LBA).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from .examples import BELTS, SensorPosterior, Strip, sensor_posterior, sorted_be
 Advance = Callable[[str, float | None], None]
 TASKS: Mapping[str, Callable[[], NoisyTask]] = {"sorting": noisy_sorting, "patrol": noisy_patrol}
 TRAJECTORIES, STEPS = 2, 3
-# Where most states are hidden, three steps from anywhere are mostly unseen.
+# With most states hidden, three steps from anywhere are mostly hidden.
 HIDDEN_STEPS = 10
 OBSERVABILITY = 30
 # Methods that do not compile, or learn once from everything, get so many of the streams.
@@ -151,18 +151,18 @@ def draw_streams(
 
 
 class MethodResult(NamedTuple):
-    """One method on its streams.
+    """Result of one method on its streams.
 
     Fields
     ------
     name : str
     sessions : int ``[T]``
-        After which it was measured.
+        Sessions after which it was measured.
     weights : float ``[replications, T, K]``
     agreement : float ``[replications, T, J]`` or None
-        Learned agreement probabilities of what the learner knows, the task's predicates first.
+        Learned agreement probabilities of the learner's predicates, the task's first.
     divergence : float ``[replications, T]`` or None
-        Of the predicates' from the true ones, mean over predicates, in nats.
+        Divergence from the true probabilities, mean over predicates, in nats.
     accuracy : float ``[replications, T, 3]``
         LBA over :data:`STATES`.
     state
@@ -380,8 +380,8 @@ def _one_by_one(key: Array, learner: Learner, streams: Streams, run: int) -> tup
 def taken_at_face_value(mdp: TabularMDP, reports: Demonstration) -> tuple[TabularMDP, Demonstration]:
     """Take observations for truths, for a learner without a noise model: each pair by itself, anywhere.
 
-    Wrong reports follow one another as no process could, so transitions say nothing; pairs that are not
-    offered at all are dropped.
+    Wrong observations follow one another as no process could, so transitions carry no information;
+    unavailable pairs are dropped.
     """
     seen = np.asarray(reports.kind) == SEEN
     states, actions = np.asarray(reports.state)[seen], np.asarray(reports.action)[seen]

@@ -1,4 +1,4 @@
-"""The main job: learn a patrol's rewards online through a keyhole, and walk past the patrollers unseen."""
+"""Main study: learn a patrol's rewards online through a keyhole, and walk past the patrollers undetected."""
 
 from __future__ import annotations
 
@@ -75,7 +75,7 @@ class MethodResult(NamedTuple):
     error : float ``[replications * patrollers, T]``
         ILE relative to the value of the optimal policy.
     log_likelihood : float ``[replications * patrollers, T]``
-        Exact, of fresh demonstrations that nobody learned from; nats per trajectory.
+        Exact, of fresh demonstrations; nats per trajectory.
     seconds : float ``[replications, T]``
         Learning time up to there, all patrollers together.
     breach : BreachOutcome or None
@@ -94,7 +94,7 @@ class MethodResult(NamedTuple):
 
 
 class Study(NamedTuple):
-    """A study of one patrol: settings, the methods' results, and one stretch the first learner looked at."""
+    """Study of one patrol: settings, the methods' results, and one stretch observed by the first learner."""
 
     patrol: Patrol
     observability: int
@@ -265,7 +265,7 @@ def _random(patrol: Patrol, key: jax.Array, demonstrations: Sequence[Demonstrati
 def _likelihoods(
     patrol: Patrol, observability: int, weights: Float[np.ndarray, "n K"]
 ) -> Float[np.ndarray, " n"]:
-    """Nats per trajectory of fresh demonstrations, the same for everybody and learned from by nobody."""
+    """Compute nats per trajectory of fresh demonstrations, the same for all methods."""
     fresh = concatenate(demonstrate(jax.random.key(10**6), patrol, observability, 60, STEPS_PER_SESSION))
     view = patrol.visibility(observability)
     likelihood = lax.map(

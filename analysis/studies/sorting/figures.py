@@ -1,4 +1,4 @@
-"""Pictures of the sorting study: clusters, what each way does, and what was learned from how much."""
+"""Figures of the sorting study: components, their behaviours, and learning against data."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The sorting study told: tables, figures, and the report that ``i2rl run sorting`` writes."""
+"""Page of the sorting study, which ``i2rl run sorting`` writes: tables and figures."""
 
 from __future__ import annotations
 

@@ -1,8 +1,8 @@
-"""Onion sorting in several ways at once (Figure 7.8, Table 7.2): who finds them, from how much, how fast.
+"""Study of onion sorting with several behaviours (Figure 7.8, Table 7.2): recovery, data and time of each
+method.
 
-Sorters who behave in two or three ways are learned from one jumble of their trajectories, by batch and online
-MME-MTIRL and by the baselines, all from the same trajectories. Learning is timed after a first call that
-compiles.
+Batch and online MME-MTIRL and the baselines learn two or three behaviours from the same mixed trajectories.
+Learning is timed after a first call that compiles.
 """
 
 from __future__ import annotations
@@ -99,23 +99,23 @@ class MethodResult(NamedTuple):
 
 
 class SortingStudy(NamedTuple):
-    """Settings, results, and Table 7.2 with the weights of the first run.
+    """Settings, results, and Table 7.2 with the weights of the first replication.
 
     Fields
     ------
     sorting : Sorting
     tasks, n_components, steps, replications, seed : int
-        Behaviours demonstrated; ways that learners begin with; steps of a trajectory.
+        Behaviours demonstrated; components that learners begin with; steps of a trajectory.
     counts : int ``[T]``
         Numbers of trajectories that batch methods learn from.
     sessions : int ``[J]``
         Trajectories that the online learner has seen at the end of each session.
     results : tuple of MethodResult
     one_component : float
-        EVD of the best single behaviour for all trajectories of the first run: what a learner that tells
-        nothing apart can reach.
+        EVD of the best single behaviour for all trajectories of the first replication: the best of a learner
+        with one component.
     demonstration, labels
-        All trajectories of the first run, and their behaviours.
+        All trajectories of the first replication, and their behaviours.
     table : SortingTable
     """
 
@@ -167,7 +167,7 @@ def sorting_study(
     belts: int = 300,
     advance: Advance = lambda description, fraction: None,
 ) -> SortingStudy:
-    """Learn the sorters' ways with every method, from more and more of the same trajectories.
+    """Learn the sorters' behaviours with every method, from growing numbers of the same trajectories.
 
     Parameters
     ----------
@@ -179,13 +179,13 @@ def sorting_study(
     replications, seed : int
         Independent repetitions. A smaller number of trajectories is the beginning of a larger one's.
     methods : sequence of str, optional
-        Keys of :data:`METHODS`, all by default. EM-MLIRL is given the true number of ways, as in the
-        dissertation, or, not told, ``n_components`` of them like MME-MTIRL; both from as many starts as that.
+        Keys of :data:`METHODS`, all by default. EM-MLIRL is given the true number of components, as in the
+        dissertation, or ``n_components`` of them like MME-MTIRL; both from as many starts as that.
     sessions : int, optional
         The online learner's, equal in size. By default its sessions end at ``counts``, as in the
         dissertation.
     n_components : int
-        Ways that MME-MTIRL starts from: the most it can find.
+        Components that MME-MTIRL starts with: the most it can find.
     steps : int
         Of a trajectory.
     belts : int
@@ -219,7 +219,7 @@ def sorting_study(
         else:
             fits = _batch_fits(sorting.mdp, method, tasks, n_components, sizes)
             with warnings.catch_warnings():
-                # That fewer trajectories than ways give fewer ways is said once, with the results.
+                # The results state once that fewer trajectories than components give fewer components.
                 warnings.filterwarnings("ignore", "[0-9]+ ways were to be started from")
                 measured = _batch(sorting, tasks, METHODS[method], fits, streams, tell)
         results.append(measured)
@@ -327,7 +327,7 @@ def _batch_fits(
     if method == DPM:
         return dict.fromkeys(sizes.tolist(), dpm_birl(mdp).fit)
     given = tasks if method == EM else n_components
-    # EM refuses more ways than trajectories.
+    # EM requires at most as many components as trajectories.
     return {
         n: em_mlirl(mdp, n_components=min(given, n), restarts=DEFAULT_RESTARTS).fit for n in sizes.tolist()
     }

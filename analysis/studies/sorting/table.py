@@ -1,13 +1,13 @@
-"""Table 7.2 side by side: precision and recall of learned ways of sorting, simulated and as published.
+"""Table 7.2 side by side: precision and recall of learned sorting, simulated and as published.
 
-What each method learned is carried out on simulated belts (:mod:`i2rl.domains.sorting.line`) beside the
-experts. What is and is not comparable:
+Each learned policy runs on simulated belts (:mod:`i2rl.domains.sorting.line`) beside the experts.
+Comparability of the numbers:
 
 - The dissertation carried out each policy once, on 24 onions, on a robot. Seven of twelve blemished onions
   found is a recall of 58 % with a 95 % interval from 32 to 81 %: most differences between its rows are within
   chance. Here hundreds of belts are sorted and the interval is a few percent; both are shown.
 - The line's times are calibrated to the dissertation's *expert* row, so that row agrees by construction; only
-  the distances of learned rows from it say anything.
+  the distances of learned rows from it are informative.
 - A learned policy equal to the expert's gives the expert's numbers here, to the digit, since all rows sort
   the same belts. On the robot its row differed by chance.
 - Every method sorts for the same time here. On the robot, online MME-MTIRL began earlier, since it had
