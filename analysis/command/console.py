@@ -27,7 +27,7 @@ def print_results(teller: Any, study: Any, folder: Path, as_json: bool) -> None:
         print(json.dumps(json.loads((folder / "results.json").read_text(encoding="utf-8"))))
         return
     teller.print_tables(study, output_console())
-    print(printable(f"Report: {folder / 'index.html'}"))
+    print(printable(f"Page: {folder / 'index.html'}"))
 
 
 @contextmanager

@@ -32,7 +32,7 @@ class MultiTask(StrEnum):
     online = "online"
     dpm_birl = "dpm-birl"
     em_mlirl = "em-mlirl"
-    em_mlirl_untold = "em-mlirl-untold"
+    em_mlirl_unknown = "em-mlirl-unknown"
     all = "all"
 
 

@@ -93,7 +93,7 @@ def _print_history(view: JournalView, records: list[SessionRecord]) -> None:
     if weights.shape[-1:] == (len(origin.feature_names),) and weights.ndim <= 2:
         print_rewards(console, origin.feature_names, weights, "Reward weights")
     if "agreement" in records[-1].report:
-        sensor = Table(title="How often reports agree with the truth")
+        sensor = Table(title="Agreement of observations with the truth")
         sensor.add_column("predicate")
         sensor.add_column("agreement", justify="right")
         for j, agreement in enumerate(records[-1].report["agreement"]):

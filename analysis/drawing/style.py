@@ -166,7 +166,7 @@ _FAMILIES = (
             "online MME-MTIRL": 1,
             "DPM-BIRL": 2,
             "EM-MLIRL": 3,
-            "EM-MLIRL, not told": 4,
+            "EM-MLIRL, number unknown": 4,
         },
     ),
     _Family(
@@ -223,7 +223,7 @@ METHOD_LOOKS = {
 """Palette by method: places of its colour in ``Theme.series``, of its dashes and of its marker."""
 _SAME = {
     "LME-I2RL, seen": "LME-I2RL",
-    "batch LME, one run": "batch LME",
+    "batch LME, once": "batch LME",
     "BIRL, blocked moves stay put": "BIRL",
 }
 

@@ -76,7 +76,7 @@ def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
             panel.plot(
                 result.pairs, band.mean, label=name, linewidth=1.8, markersize=5, markevery=every, **style
             )
-        dress(panel, theme, x="reported state-action pairs seen", y=names[measure])
+        dress(panel, theme, x="observed state-action pairs", y=names[measure])
         panel.set_xlim(left=0)
         panel.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         panel.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
@@ -169,7 +169,7 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
                 markeredgecolor=theme.ink,
                 markeredgewidth=1.5,
             )
-    dress(axes, theme, x="share of what noise cost that is won back", grid="x")
+    dress(axes, theme, x="share of the loss to noise recovered", grid="x")
     # Only its colour marks a domain's second row.
     names = [
         "" if i and r is rows[i - 1][0] else f"{r.title}: {MEASURED[r.measure]}"
@@ -206,7 +206,7 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
     foot(
         figure,
         theme,
-        "one seed a row, no interval"
+        "one replication a row, no interval"
         if replications == [1]
         else f"bar: 95% interval, bootstrap over {listed([str(n) for n in replications])} replications",
     )
@@ -337,7 +337,7 @@ def belief_plot(belief: Belief, theme: Theme, title: str = "What happened, and w
             markersize=6,
             markeredgewidth=1.4,
             color=theme.series[1],
-            label="reported",
+            label="observed",
         ),
         Line2D([], [], color=theme.ink, linewidth=1.3, linestyle=(0, (4, 1.5)), label="truth"),
         Line2D([], [], color=theme.series[0], linewidth=1.8, label="posterior mean"),
@@ -348,7 +348,9 @@ def belief_plot(belief: Belief, theme: Theme, title: str = "What happened, and w
     reported, believed = (np.sum((x - belief.truth) ** 2, 0) for x in (belief.reported, belief.mean))
     wrong = reported > 0
     errors = np.sqrt(believed[wrong] / reported[wrong]).mean() if wrong.any() else np.nan
-    left = f"; its mean errs {errors:.0%} as much as the reports (root mean square)" if wrong.any() else ""
+    left = (
+        f"; its mean errs {errors:.0%} as much as the observations (root mean square)" if wrong.any() else ""
+    )
     foot(
         figure,
         theme,

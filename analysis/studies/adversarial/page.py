@@ -119,12 +119,12 @@ def recovery_table(results: AdversarialResults) -> Table:
         if found is not None:
             share = _printed_recovery(results.domain, name)
             printed_cell = _NONE if share is None else f"{share:.0%}"
-            rows.append((f"of that won back by {name}", _recovered(found), printed_cell))
+            rows.append((f"of that recovered by {name}", _recovered(found), printed_cell))
     return Table(
         ("", "measured", "dissertation"),
         rows,
-        f"Lost: (clean - noisy) / clean of mean {measure}. Won back: (robust - noisy) / (clean - noisy), "
-        "with a 95 % interval by drawing seeds with replacement, which of few replications is too narrow.",
+        f"Lost: (clean - noisy) / clean of mean {measure}. Recovered: (robust - noisy) / (clean - noisy), "
+        "with a 95 % interval by a bootstrap over replications, too narrow for few replications.",
     )
 
 
@@ -155,7 +155,7 @@ def correlation_table(results: AdversarialResults) -> Table:
         rows,
         "Learned against true reward on held-out episodes of a mix of policies, from the expert's to a "
         "uniform one; trajectories by their sums, over equally long episodes unless the task itself ends "
-        "them. Mean over replications and Student's 95 % interval (of one seed: a bootstrap of "
+        "them. Mean over replications and Student's 95 % interval (of one replication: a bootstrap of "
         "trajectories with "
         "replacement); none where a reward is the same in all steps. The dissertation's (Table 7.4, Pearson) "
         "come with p-values that fit 4 to 7 points each.",
@@ -274,9 +274,9 @@ def _correlated(found: Sequence[Correlation]) -> tuple[str, str]:
 def _recovered(found: Recovery) -> str:
     if found.lost < 1 and not (math.isfinite(found.low) and math.isfinite(found.high)):
         told = "not known" if found.lost < 0.5 else f"{found.share:.0%}, interval not known"
-        return f"{told}: noise cost something in {found.lost:.0%} of resamples only"
+        return f"{told}: noise had a cost in {found.lost:.0%} of resamples only"
     if found.n == 1:
-        return f"{found.share:.0%} (one seed, no interval)"
+        return f"{found.share:.0%} (one replication, no interval)"
     return f"{found.share:.0%} ({found.low:.0%} to {found.high:.0%})"
 
 
@@ -417,7 +417,7 @@ def _lead(all_results: Sequence[AdversarialResults]) -> Lead:
         if found is not None:
             known = found.lost == 1 and math.isfinite(found.share)
             trust.append(
-                f"in {name} {_recovered(found)} of what noise cost is won back"
+                f"in {name} {_recovered(found)} of the loss to noise is recovered"
                 if known
                 else f"in {name} these replications do not show that noise cost anything"
             )
@@ -434,7 +434,7 @@ def _lead(all_results: Sequence[AdversarialResults]) -> Lead:
 
 
 def _recovery_section(all_results: Sequence[AdversarialResults], folder: Path) -> Section:
-    told = "Of what noise takes from AIRL, the share that a learner wins back who reckons with the noise."
+    told = "Share of AIRL's loss to noise that a learner with a noise model recovers."
     picture = drawn(folder, "recovery", partial(figures.recovery_plot, all_results), told, told)
     return Section("What robustness recovers", "", [], [picture])
 
@@ -446,7 +446,8 @@ def _strip_section(strip: Strip, mdp: TabularMDP, folder: Path, i: int) -> Secti
         folder,
         f"strip-{i}",
         partial(strip_plot, strip, mdp),
-        "A new trajectory with a misreport, as robust-AIRL of the first seed understands it in the end.",
+        "A new trajectory with a wrong observation, completed by the last robust-AIRL of the first "
+        "replication.",
         "Grid of pairs against steps shaded by posterior probability, with what was seen and what happened",
     )
     return Section("What one learner believes of a trajectory", "", [], [picture])
@@ -463,9 +464,9 @@ _NOTES = {
 
 def _text(results: AdversarialResults) -> str:
     told = (
-        f"The expert's states and actions are reported with noise: {results.noise}. "
+        f"The expert's states and actions are observed with noise: {results.noise}. "
         f"{counted(results.replications, 'independent replication')}; "
-        "all methods of a seed see the same demonstrations "
+        "all methods of a replication see the same demonstrations "
         "and have equal budgets."
     )
     return "\n\n".join([told, *([_NOTES[results.domain]] if results.domain in _NOTES else [])])
@@ -481,7 +482,7 @@ def _sections(results: AdversarialResults, folder: Path) -> list[Section]:
         "learning",
         partial(figures.learning_plot, results),
         "Learning against the pairs seen (Figures 7.11 to 7.13). Axes need not begin at zero.",
-        "Learned behaviour accuracy or return against reported pairs, a line a method",
+        "Learned behaviour accuracy or return against observed pairs, a line a method",
     )
     first = [tables[name] for name in ("recovery", "breaches", "errors") if name in tables]
     sections = [Section(results.title, _text(results), first, [learning])]
@@ -500,7 +501,7 @@ def _sections(results: AdversarialResults, folder: Path) -> list[Section]:
             scatter = picture(
                 "rewards",
                 partial(figures.scatter_plot, results.scatters, title=title),
-                "Learned against true rewards of the first seed. A learned reward has its own scale.",
+                "Learned against true rewards of the first replication. A learned reward has its own scale.",
                 "Learned reward against true reward, a panel a method",
             )
             pictures.append(scatter)
@@ -510,8 +511,8 @@ def _sections(results: AdversarialResults, folder: Path) -> list[Section]:
         belief = picture(
             "belief",
             partial(figures.belief_plot, results.belief),
-            "A noisy trajectory as robust-AIRL of the first seed understands it in the end.",
-            "Reports, truth and posterior band of a trajectory's components against time",
+            "A noisy trajectory completed by the last robust-AIRL of the first replication.",
+            "Observations, truth and posterior band of a trajectory's components against time",
         )
         sections.append(Section(f"{results.title}: what is believed of the truth", "", [], [belief]))
     if results.frames:

@@ -48,7 +48,7 @@ LEVEL = 0.05
 ASSUMED = 0.15
 """Probability of both confusions that a learner of the sensor begins with."""
 
-MISREPORT, POLICY = "probability of a misreport", "policy of robust-AIRL, first seed"
+MISREPORT, POLICY = "probability of a wrong observation", "policy of robust-AIRL, first replication"
 """Settings of the results from which :func:`believed_trajectories` are drawn."""
 
 
@@ -231,7 +231,8 @@ def patrol_results(
             raise ValueError(f"there must be at least one {what}, got {count}")
     if not 0 < noise * LEVEL <= 1:
         raise ValueError(
-            f"noise multiplies the probability of {LEVEL:g} that an observation errs, so that it is above 0 and at "
+            f"noise multiplies the probability of {LEVEL:g} that an observation errs; it must be "
+            f"above 0 and at "
             f"most {1 / LEVEL:g}; got {noise}"
         )
     level, patrol = noise * LEVEL, instance(2)
@@ -276,8 +277,8 @@ def patrol_results(
             "iterations": iterations,
             "memory of earlier sessions": 0.0,
             "trials of a breach, a policy": trials,
-            "probability of a misreport, before it is learned": ASSUMED,
-            "learned probabilities of misreports, a row a seed": noises,
+            "probability of a wrong observation, before learning": ASSUMED,
+            "learned probabilities of wrong observations, a row a replication": noises,
             POLICY: first.round(6).tolist(),
         },
         expert_breaches=float(success_rates(patrol, true, trials).mean()),

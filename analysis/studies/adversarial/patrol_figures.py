@@ -69,7 +69,7 @@ def noise_curves(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     panels[0].set_ylim(np.floor(least * 20) / 20, 1.005)
     panels[0].set_ylabel("learned behaviour accuracy\n(share of states)", color=theme.ink, fontsize=TEXT)
     shown = {label: h for p in panels for h, label in zip(*p.get_legend_handles_labels(), strict=True)}
-    title = f"Patrol, {level:.0%} of forward moves and right turns misreported"
+    title = f"Patrol, {level:.0%} of forward moves and right turns observed wrongly"
     head(figure, theme, list(shown.values()), title=title)
     replications = max(len(r["accuracy"]) for r in results["noise"].values() if "accuracy" in r)
     foot(
@@ -104,7 +104,12 @@ def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
         if clean is not None:
             label = _with_memory(CLEAN, memory)
             left.axhline(_last(clean).mean(), color=theme.ink, linewidth=1.2, linestyle=dash, label=label)
-    dress(left, theme, title=f"Accuracy, mean of the last {LAST} sessions", x="probability of a misreport")
+    dress(
+        left,
+        theme,
+        title=f"Accuracy, mean of the last {LAST} sessions",
+        x="probability of a wrong observation",
+    )
     left.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     left.set_xticks(levels)
     # One level alone is one place, however many methods stand side by side there.
@@ -114,7 +119,7 @@ def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     for axis in (left.yaxis, right.xaxis):
         axis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     handles = left.get_legend_handles_labels()[0]
-    head(figure, theme, handles, title="What misreports cost on patrol", columns=2)
+    head(figure, theme, handles, title="Cost of wrong observations on patrol", columns=2)
     foot(
         figure,
         theme,
@@ -140,7 +145,11 @@ def _breaches(axes: Axes, results: Results, theme: Theme, level: float) -> None:
         axes.hlines(y, mean - half, min(mean + half, 1.0), color=theme.series[0], linewidth=2.2, alpha=0.65)
         axes.plot(mean, y, linestyle="", marker="o", markersize=7, color=theme.series[0])
     dress(
-        axes, theme, title=f"Breaches that succeed, {level:.0%} misreports", x="share of breaches", grid="x"
+        axes,
+        theme,
+        title=f"Breaches that succeed, {level:.0%} wrong observations",
+        x="share of breaches",
+        grid="x",
     )
     axes.set_yticks(range(len(named)), [label for label, _ in named], fontsize=SMALL)
     axes.set_ylim(len(named) - 0.4, -0.6)

@@ -319,7 +319,7 @@ def _settings(plan: Plan, repeats: Mapping[str, Sequence[Outcome]]) -> dict[str,
     told = {**{k: v for k, v in plan._asdict().items() if k != "settings"}, **dict(plan.settings)}
     told["environment steps"] = {m: int(outcomes[0].steps[-1]) for m, outcomes in repeats.items()}
     if LEARNED in repeats:
-        told["learned sensor, a row a seed"] = [o.sensor[-1].tolist() for o in repeats[LEARNED]]
+        told["learned sensor, a row a replication"] = [o.sensor[-1].tolist() for o in repeats[LEARNED]]
     return told
 
 
@@ -355,7 +355,9 @@ def _kept(name: str, method: str, seed: int, plan: Plan, folder: Path | None) ->
     if path.exists():
         fields = read_plain(path)
         if not isinstance(fields, dict) or fields.keys() != set(Outcome._fields):
-            raise StorageError(f"{path}: the file does not hold a finished run; delete it to run again")
+            raise StorageError(
+                f"{path}: the file must hold a finished replication; delete it to run it again"
+            )
         return Outcome(**fields)
     outcome = run(name, method, seed, plan)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -163,21 +163,21 @@ def _text(study: LabelBiasStudy) -> str:
     first = study.results[0]
     return f"""A world of 10 x 10 cells with {counted(study.walls, "wall")}, a desirable object in each of \
 two corners, deterministic moves. The law of maximum entropy makes a trajectory's log-likelihood its reward \
-less a constant, so the two correlate perfectly, whoever demonstrates.
+less a constant, so the two correlate perfectly for every expert.
 
-Bayesian IRL normalises over actions in every state. Its log-likelihood is the sum of advantages times eta, \
-which grows with the reward, less what the choices met on the way cost, and at an object in a corner there \
-are most equally good choices: moving against either edge is one more way of staying. The two pull in \
-opposite directions, and what comes out depends on how sharply experts choose.
+Bayesian IRL normalises over actions in every state. Its log-likelihood is the sum of advantages times \
+the rationality, which grows with the reward, less the cost of the choices on the path, and at an object in a corner there \
+are most equally good choices: a move against either edge stays, too. The two pull in \
+opposite directions, and the result depends on the experts' rationality.
 
-With exp(Q) as the dissertation writes it (eta 1), a discount of {DISCOUNT:g}, {first.setting.steps} steps \
-and experts that follow that law, the correlation is significant at 0.05 in \
+With exp(Q) as the dissertation writes it (rationality 1), a discount of {DISCOUNT:g}, \
+{first.setting.steps} steps and experts that follow that law, the correlation is significant at 0.05 in \
 {_share(first.significant.value)} of the worlds; chance alone would give 5 %.
 
 {_conditions(study)}
 
-The dissertation does not say which of these it used, so its number is one point of the curve below and \
-not a property of the method. That the correlation can be anything is."""
+The dissertation does not state its setting, so its number is one point of the curve below and \
+not a property of the method. The property of the method is that the correlation can take any value."""
 
 
 def _conditions(study: LabelBiasStudy) -> str:
@@ -221,7 +221,7 @@ def _lead(study: LabelBiasStudy) -> Lead:
         f"In {counted(study.worlds, 'world')} of known reward, the log-likelihood of MaxEnt correlates "
         "perfectly with the reward that a trajectory earns, and that of BIRL "
         + (
-            "with nothing, since all trajectories earn the same."
+            "with zero spread, since all trajectories earn the same."
             if np.isnan(median)
             else f"with rho {median:+.2f} (90 % of worlds: {low:+.2f} to {high:+.2f}) in the first setting."
         )

@@ -170,8 +170,8 @@ def _lead(result: LabyrinthStudy) -> Lead:
 
 def _text(result: LabyrinthStudy) -> str:
     views = [view.view for view in result.views]
-    return f"""Each bout is predicted before it is learned from, so that nothing is tested on what it \
-taught. The score is the code length of the animal's decisions, in bits; forced steps cost nobody anything. \
+    return f"""Each bout is predicted before it is learned from, so every test is on new \
+data. The score is the code length of the animal's decisions, in bits; forced steps cost zero bits. \
 Learned with: {listed(views)}.
 
 {LEARNER} learns a weight for each place reached and one each for turning round and going deeper. \

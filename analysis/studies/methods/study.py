@@ -404,7 +404,7 @@ def _tables(study: MethodsStudy) -> tuple[Table, ...]:
                 *(f"rate {learning_rate:g}" for learning_rate in study.learning_rates),
             ),
             sweep,
-            "On a run used for nothing else. Above, each method has the smallest rate within 0.01 of its "
+            "On a further replication. Above, each method has the smallest rate within 0.01 of its "
             "best. A reward table over states learns the same policy at every rate.",
         ),
         Table(
@@ -420,7 +420,7 @@ def _tables(study: MethodsStudy) -> tuple[Table, ...]:
 
 _TEXT = """Every method is given the same pairs, all of them in view. Windows of five pairs are a session, \
 which for the method of Jin et al. is five sessions of one pair; DARKO's sessions also come as it has them, \
-from goal to goal, the goals (where a patroller turns round) being told to it alone. Jin's reward is a table \
+from goal to goal; only it is given the goals (where a patroller turns round). Jin's reward is a table \
 over states and cannot say what an action costs; its second form has the features that the others have.
 
 The patrollers pass one another by stopping, which no reward explains, and they are deterministic, which a \

@@ -89,12 +89,12 @@ def summary(study: NoisyStudy) -> dict[str, Any]:
                 "posterior mean": study.posterior.draws.mean(0).tolist(),
                 "learned": study.posterior.learned.tolist(),
                 "truth": study.posterior.truth.tolist(),
-                "in these reports": study.posterior.happened.tolist(),
+                "in these observations": study.posterior.happened.tolist(),
                 "divergent transitions": study.posterior.divergences,
             },
             "features": list(study.task.mdp.feature_names),
             "true weights": study.task.weights,
-            "reward, first run": None if (found := _reward(study)) is None else found,
+            "reward, first replication": None if (found := _reward(study)) is None else found,
             "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
             "belts": None if study.belts is None else sorting_table_summary(study.belts),
         }
@@ -199,7 +199,7 @@ def _quotable(study: NoisyStudy, method: str) -> bool:
 
 
 def doubt_table(study: NoisyStudy) -> Table:
-    """Whose errors they are: agreement under what may be assumed of the expert."""
+    """Tabulate whose the errors are: agreement under assumptions about the expert."""
     rows: list[tuple[str, ...]] = []
     for method, doubt in study.doubt.items():
         for j, name in enumerate(study.task.predicate_names):
@@ -218,14 +218,15 @@ def doubt_table(study: NoisyStudy) -> Table:
             "learner",
             "predicate",
             "if the expert errs",
-            "if he is decided",
+            "if the expert is optimal",
             "truth",
             "replications identified",
         ),
         rows,
-        "Agreement of reports with the truth, fitted to all reports of a run under the reward it learned, "
-        "for an expert as erratic as was learned and for one who always acts optimally; mean of replications "
-        "(95 % interval). Where the two are more than 0.05 apart, reports do not say whose the errors are.",
+        "Agreement of observations with the truth, fitted to all observations under the learned reward, "
+        "for an expert as erratic as learned and for an optimal one; mean of replications "
+        "(95 % interval). If the two are more than 0.05 apart, observations do not identify whose "
+        "the errors are.",
     )
 
 
@@ -262,7 +263,8 @@ def hidden_table(study: NoisyStudy) -> Table:
         (f"{OBSERVABILITY} % in view", f"LBA after {early}, %", f"LBA after {study.sessions}, %"),
         rows,
         f"Sessions of {TRAJECTORIES} trajectories of {HIDDEN_STEPS} steps, the same paths in both rows. "
-        f"Hidden: reports are exact (LME-I2RL); hidden and noisy: {PLAIN}. Lost: paired over replications.",
+        f"Hidden: observations are exact (LME-I2RL); hidden and noisy: {PLAIN}. Lost: paired over "
+        f"replications.",
     )
 
 
@@ -320,31 +322,32 @@ def _title(study: NoisyStudy) -> str:
 
 def _text(study: NoisyStudy) -> str:
     bare = (
-        f"{BARE!r} has nothing but the dissertation's predicates; all pairs that they do not tell apart are "
-        "then reported at random, as far as it knows. The other learners also know parts of a pair that "
-        f"perception might mistake ({', '.join(study.task.label_names)}); that they are clear is learned. "
+        f"{BARE!r} has only the dissertation's predicates; in its model, pairs with equal predicates are "
+        "observed at random. The other learners also have labels of a pair that "
+        f"perception might confuse ({', '.join(study.task.label_names)}); they learn that these are clear. "
         if BARE in study.results
         else ""
     )
     natural = (
-        "\n\nAll trajectories start alike and are short, so reports without scores hardly identify the "
-        "sensor: an odd report may be wrong, or the expert may be odd. Scores tell the two apart. "
+        "\n\nAll trajectories start alike and are short, so observations without scores hardly identify the "
+        "sensor: an odd observation may be wrong, or the expert may be odd. Scores distinguish the two. "
         "LBA over all states counts those that are never visited, too."
         if study.starts == "natural"
         else ""
     )
-    return f"""An expert acts optimally; every pair of its trajectories is reported, some of them wrongly. \
-The learner knows neither how often nor which. There {"is" if study.replications == 1 else "are"} \
+    return f"""An expert acts optimally; every pair of its trajectories is observed, some of them wrongly. \
+The learner does not know the errors or their frequency. There {"is" if study.replications == 1 else "are"} \
 {counted(study.replications, "independent replication")} of {counted(study.sessions, "session")} \
-of {TRAJECTORIES} trajectories of {STEPS} pairs; reports and calibrated scores are the same for every method.
+of {TRAJECTORIES} trajectories of {STEPS} pairs; observations and calibrated scores are the same for \
+every method.
 
-{bare}The sensor is judged by agreement probabilities: how often a predicate of a report is that of the \
-truth. The reliabilities that parametrise the sensor are no frequencies. Controls: the constant one half; \
-reports compared with what happened (oracle); reports taken for truths (observed, RIFOM); the program as \
-printed (all).
+{bare}The sensor is judged by agreement probabilities: how often a predicate of an observation is that of \
+the truth. The reliabilities that parametrise the sensor are no frequencies. Controls: the constant one half; \
+observations compared with the truth (oracle); observations taken for truths (observed, RIFOM); the \
+program as printed (all).
 
-{CLEAR!r} learns from what happened. Methods that know the sensor or need none have the same ridge and \
-number of iterations as RIMEO; those online remember all sessions alike.{natural}"""
+{CLEAR!r} learns from the truth. Methods with a known sensor or without one have the same ridge and \
+number of iterations as RIMEO; online methods weigh all sessions equally.{natural}"""
 
 
 def _doubts(study: NoisyStudy) -> str:
@@ -360,8 +363,9 @@ def _lead(study: NoisyStudy) -> Lead:
     result, early = study.results[PLAIN], min(EARLY, study.sessions)
     final = float(result.accuracy[:, -1, 0].mean())
     learned = (
-        f"From {counted(study.sessions, 'session')} of {TRAJECTORIES} misreported trajectories each, RIMEO "
-        f"learned a reward whose policy does as the expert in {number(100 * final)} % of the states, and at "
+        f"From {counted(study.sessions, 'session')} of {TRAJECTORIES} noisy trajectories each, RIMEO "
+        f"learned a reward whose policy agrees with the expert in {number(100 * final)} % of the "
+        f"states, and at "
         "the same time how often perception is right."
     )
     reach = float(np.mean(study.chance >= final - 1e-9))
@@ -375,9 +379,9 @@ def _lead(study: NoisyStudy) -> Lead:
         else f"a mean of {counted(study.replications, 'replication')}"
     )
     sensor = (
-        "and the sensor, which these reports identify"
+        "and the sensor, which these observations identify"
         if _quotable(study, PLAIN)
-        else "but not the sensor, whose errors these reports do not tell from the expert's"
+        else "but not the sensor, whose errors these observations do not separate from the expert's"
     )
     verdict = "Trust the policy" if reach <= 0.05 else "Do not take the accuracy for evidence"
     trust = f"{verdict} ({chance}; {replications}), {sensor}."
@@ -398,12 +402,12 @@ def _lead(study: NoisyStudy) -> Lead:
                 study.task.mdp.feature_names, result.weights[0, -1], study.task.weights, strict=True
             )
         ]
-        told = "Weights of the first run after its last session, without intervals: no posterior was drawn."
+        told = "Weights of the first replication after its last session, without intervals or a posterior."
         return Lead(learned, trust, [Table(("feature", "weight", "true weight"), plain_rows, told)])
     table = Table(
         ("feature", f"weight, {PLAIN}", "posterior median", "95 % interval", "true weight"),
         rows,
-        f"Weights of the first run after its last session, and the posterior (NUTS) of its first "
+        f"Weights of the first replication after its last session, and the posterior (NUTS) of its first "
         f"{counted(early, 'session')}. A reward is known up to its length.",
     )
     return Lead(learned, trust, [table])
@@ -415,7 +419,7 @@ def write(study: NoisyStudy, folder: Path | str) -> Path:
         folder,
         "divergence",
         partial(figures.divergence_plot, study),
-        "How far the learned sensor is from the true one (Figures 7.9 and 7.10).",
+        "Distance of the learned sensor from the true one (Figures 7.9 and 7.10).",
         "Divergence of agreement probabilities against sessions, logarithmic, RIMEO and controls",
     )
     accuracy = drawn(
@@ -423,15 +427,16 @@ def write(study: NoisyStudy, folder: Path | str) -> Path:
         "accuracy",
         partial(figures.accuracy_plot, study),
         "Learned behaviour accuracy. The axis does not begin at zero.",
-        "Learned behaviour accuracy against sessions for RIMEO, RIFOM and learners that know the sensor",
+        "Learned behaviour accuracy against sessions for RIMEO, RIFOM and learners with a known sensor",
     )
     strip = drawn(
         folder,
         "strip",
         partial(figures.strip_plot, study.strip, study.task.mdp),
-        f"A new trajectory as the first run's learner ({PLAIN}) understands it after its last session. Pairs "
+        f"A new trajectory completed by the first replication's learner ({PLAIN}) after its last "
+        f"session. Pairs "
         "that are never likely are left out.",
-        "Grid of pairs against steps shaded by posterior probability, with what was seen and what happened",
+        "Grid of pairs against steps shaded by posterior probability, with the observations and the truth",
     )
     sections = [
         Section("The sensor", _text(study), [sensor_table(study)], [divergence]),
@@ -439,13 +444,13 @@ def write(study: NoisyStudy, folder: Path | str) -> Path:
         Section("Behaviour", "", [behaviour_table(study)], [accuracy]),
     ]
     if study.hidden is not None:
-        text = "The view is the patrol study's: a mask of states. What is seen in it may be misreported."
-        sections.append(Section("Out of view, and misreported", text, [hidden_table(study)]))
+        text = "The view is the patrol study's: a mask of states. Observations of states in view may err."
+        sections.append(Section("Hidden and noisy", text, [hidden_table(study)]))
     believed = study.strip.believed
     told = (
-        "No report of this trajectory is wrong."
+        "Every observation of this trajectory is right."
         if math.isnan(believed)
-        else f"Where a report is wrong, what happened has posterior probability {believed:.2f} on average."
+        else f"At wrong observations the truth has posterior probability {believed:.2f} on average."
     )
     pictures = [strip]
     if study.posterior is not None:

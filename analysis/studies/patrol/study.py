@@ -221,7 +221,8 @@ def patrol_study(
 
 
 class _Learned(NamedTuple):
-    """One run of one method: sessions ``[T]``, ``weights [P, T, K]``, cumulative seconds ``[T]``."""
+    """Results of one replication of one method: sessions ``[T]``, ``weights [P, T, K]``, cumulative "
+    "seconds ``[T]``."""
 
     points: np.ndarray
     weights: np.ndarray
@@ -388,11 +389,11 @@ def summary(study: Study) -> dict[str, Any]:
     reward: dict[str, Any] = {
         "features": list(study.patrol.mdp.feature_names),
         "true weights": study.patrol.weights,
-        "learned, first run": [
+        "learned, first replication": [
             {"patroller": who, "method": study.methods[0].name, "weights": found.estimates.summary()}
             for who, found in _by_patroller(study).items()
         ],
-        "by method, run and patroller": {m.name: m.weights[:, :, -1] for m in study.methods},
+        "by method, replication and patroller": {m.name: m.weights[:, :, -1] for m in study.methods},
     }
     told: dict[str, Any] = plain(
         {
@@ -485,7 +486,7 @@ def _lead(study: Study) -> Lead:
     first, row = study.methods[0], _rows(study)[0]
     if not study.determined:
         return Lead(
-            f"Nothing was learned here: {listed([m.name for m in study.methods])} were only measured.",
+            f"No learning here: {listed([m.name for m in study.methods])} were only measured.",
             "Trust the numbers as those of a control.",
         )
     whose = "the patroller's reward" if len(study.determined) == 1 else "the rewards of both patrollers"
@@ -511,7 +512,8 @@ def _lead(study: Study) -> Lead:
     )
     tables = [
         found.estimates.table(
-            f"Weights of {who} that {first.name} learned in the first run. Intervals are those of the "
+            f"Weights of {who} that {first.name} learned in the first replication. Intervals are "
+            f"those of the "
             "likelihood's curvature there; a reward is known up to its length, hence the shares.",
             np.asarray(study.patrol.weights),
         )
@@ -538,12 +540,12 @@ def _text(study: Study) -> str:
 
 Chance: of {counted(len(study.chance), "weight vector")} drawn at random, half have an LBA of at least \
 {_percent(median)}, and {_percent(_share_as_good(study))} have the {_percent(float(reached))} of \
-{first.name} or more. The row of random weights is one such draw a patroller and run.
+{first.name} or more. The row of random weights is one such draw a patroller and replication.
 
 Likelihood: it is that of a policy which errs the less the longer its weights are, and the patrollers never \
 err. The true weights are given in no such units. As given they reach {number(study.truth.as_given)} nats a \
 trajectory, stretched {number(stretched)} times {number(best)}, and {first.name} {number(learned)}. Learned \
-weights maximise the likelihood of what was seen, their length included; the true weights maximise nothing, \
+weights maximise the likelihood of what was seen, their length included; the true weights do not maximise it, \
 so that a likelihood above theirs is no error."""
 
 
@@ -609,7 +611,7 @@ def write(study: Study, folder: Path | str) -> Path:
                 folder,
                 "success",
                 lambda theme: success_rates(rates, theme=theme),
-                "Share of simulated breaches that reached a goal unseen, and that timed out.",
+                "Share of simulated breaches that reached a goal undetected, and that timed out.",
                 "Success and time-out rates by method",
             )
         )
@@ -622,8 +624,7 @@ def write(study: Study, folder: Path | str) -> Path:
 
 def _draw_time(study: Study, learning: Sequence[MethodResult], theme: Theme) -> Figure:
     times = [
-        LearningTime(m.name if m.name != BATCH else "batch LME, one run", m.points, m.seconds)
-        for m in learning
+        LearningTime(m.name if m.name != BATCH else "batch LME, once", m.points, m.seconds) for m in learning
     ]
     if study.batch_rerun_seconds is not None:
         every = np.arange(1, study.sessions + 1)

@@ -81,7 +81,7 @@ def feature_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.nd
 def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
     """Trajectories of the first run on two principal components of feature counts, a panel a method.
 
-    The marker is the true way; the colour the way found.
+    The marker is the true component; the colour the component found.
     """
     mdp = study.sorting.mdp
     embedding = embed(feature_counts(mdp, study.demonstration))
@@ -139,7 +139,8 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
             marker="o",
             markersize=8,
             color=theme.series[d % _COLOURS],
-            label=f"found: way {d + 1}" + (" (more reuse colours)" if d == _COLOURS - 1 < most - 1 else ""),
+            label=f"found: component {d + 1}"
+            + (" (more reuse colours)" if d == _COLOURS - 1 < most - 1 else ""),
         )
         for d in range(min(most, _COLOURS))
     ]
@@ -161,7 +162,7 @@ def _numbered(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"])
     return matched + [component for component in np.unique(assignments).tolist() if component not in matched]
 
 
-# -- what a way does ----------------------------------------------------------------------------------
+# -- behaviour of a component -------------------------------------------------------------------------
 
 # Where an onion is, left to right, and what is thought of it, from top to bottom; the bin below all.
 _COLUMN = {TABLE: 0.0, PUT_BACK: 0.0, HELD: 1.9, INSPECTED: 3.8}
@@ -237,7 +238,7 @@ def components_diagram(study: SortingStudy, theme: Theme) -> Figure:
             fontsize=TEXT + 1,
             loc="left",
         )
-    which = "Ways" if len(components) == len(shown) else f"{len(shown)} of {len(components)} ways"
+    which = "Components" if len(components) == len(shown) else f"{len(shown)} of {len(components)} components"
     head(figure, theme, [], title=f"{which} found by {result.name}: what is done with an onion")
     foot(
         figure,
@@ -451,7 +452,7 @@ def components_plot(study: SortingStudy, theme: Theme) -> Figure:
         panel.set_xticks(range(len(result.trajectories)), [f"{n}" for n in result.trajectories])
         panel.set_xlim(-0.6, len(result.trajectories) - 0.4)
         panel.tick_params(axis="y", left=i == 0)
-    panels[0].set_ylabel("ways found", color=theme.ink)
+    panels[0].set_ylabel("components found", color=theme.ink)
     panels[0].set_ylim(0.3, most + 0.7)
     panels[0].yaxis.set_major_locator(MaxNLocator(integer=True))
     disc: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 10}
@@ -460,7 +461,7 @@ def components_plot(study: SortingStudy, theme: Theme) -> Figure:
         Line2D([], [], color=theme.series[1], label="another", **disc),
         Line2D([], [], color=theme.goal, linewidth=1.6, label=f"truth: {study.tasks}"),
     ]
-    head(figure, theme, handles, title="Number of ways found")
+    head(figure, theme, handles, title="Number of components found")
     foot(figure, theme, f"area of a disc: share of {_all_runs(study)}")
     return figure
 

@@ -45,13 +45,13 @@ STEPS = 50
 # Fewer, since every method is compiled for every number of trajectories.
 FEW = {2: (4, 8, 16), 3: (6, 12, 24)}
 
-BATCH, ONLINE, DPM, EM, EM_UNTOLD = "mme-mtirl", "online", "dpm-birl", "em-mlirl", "em-mlirl-untold"
+BATCH, ONLINE, DPM, EM, EM_UNKNOWN = "mme-mtirl", "online", "dpm-birl", "em-mlirl", "em-mlirl-unknown"
 METHODS = {
     BATCH: "MME-MTIRL",
     ONLINE: "online MME-MTIRL",
     DPM: "DPM-BIRL",
     EM: "EM-MLIRL",
-    EM_UNTOLD: "EM-MLIRL, not told",
+    EM_UNKNOWN: "EM-MLIRL, number unknown",
 }
 
 
@@ -429,7 +429,7 @@ def _measures(columns: Sequence[Sequence[tuple[float, ...]]]) -> Measures:
 
 
 def _behaviours_of(labels: Int[np.ndarray, " n"], found: Clustering) -> Float[np.ndarray, "B K"]:
-    """Learned weights of each behaviour; without a way of its own, that of most of it."""
+    """Return the learned weights of each behaviour: its component's, or that of most of its trajectories."""
     assignments = found.assignments
     matched = match_components(labels, assignments)
     rows = [

@@ -289,7 +289,7 @@ def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str 
                 here = getattr(row.tally, measure)(table.level)
                 if math.isnan(here.value):
                     panel.annotate(
-                        "nothing binned", (0.015, y), va="center", color=theme.muted, fontsize=TEXT - 1
+                        "no onion binned", (0.015, y), va="center", color=theme.muted, fontsize=TEXT - 1
                     )
                 panel.hlines(y, here.low, here.high, color=ours, linewidth=2.4)
                 panel.plot(here.value, y, "o", markersize=6.5, color=ours, clip_on=False)
