@@ -1,4 +1,4 @@
-"""Shared by the benchmarks: medians of several runs, a JSON file, and a table."""
+"""Shared parts of the benchmarks: medians of several runs, a JSON file, and a table."""
 
 from __future__ import annotations
 

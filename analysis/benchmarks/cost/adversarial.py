@@ -4,9 +4,9 @@
 ``build/bench/adversarial_cost.json``. For comparison, the logs released with the dissertation put one such
 update (continuous onions) at a median of 0.86, 1.6 and 4.8 minutes on three machines.
 
-Parts, each compiled before it is timed: smoothing and drawing the truth behind a window of 32 reported pairs
+Parts, each compiled before it is timed: smoothing and drawing the truth behind a window of 32 observed pairs
 under the current policy with the dynamics as last linearised (*draw*), the same after linearising anew
-(*look*, which simulates), and the update of the discriminator on the draws (*update*).
+(*refresh*, which simulates), and the update of the discriminator on the draws (*update*).
 """
 
 from __future__ import annotations

@@ -9,13 +9,13 @@
 - seconds of a session against the number of predicates, of states, and of pairs in a session, with the
   exponent of a power of that number fitted to the medians.
 
-Section 6.1.4 has it that "the complexity of each iteration of each session is
-``O(m |Xi_d| L N_sa + L K + m^2 n_bfgs + eta)``, where ``eta = n_RL + n_desc``": ``m`` predicates, ``|Xi_d|``
-trajectories of ``L`` steps, ``N_sa`` pairs, ``K`` features, and three numbers of iterations taken for
-constants. It is linear in pairs ``N_sa``, linear in the steps of a session, and of degree two in ``m``. Two
-costs are not in it: planning and smoothing, and normalising Eq. 6.5, which is a sum over reports for every
-class of truths. Here that is ``O(C E (m + 1) + E m^2)`` a Newton step for ``C`` classes and ``E`` patterns of
-agreement, with ``E <= min(2^m, C^2)``: no polynomial in ``m`` until all pairs differ.
+Section 6.1.4 states that "the complexity of each iteration of each session is ``O(m |Xi_d| L N_sa + L K + m^2
+n_bfgs + eta)``, where ``eta = n_RL + n_desc``": ``m`` predicates, ``|Xi_d|`` trajectories of ``L`` steps,
+``N_sa`` pairs, ``K`` features, and three numbers of iterations taken for constants. It is linear in pairs
+``N_sa``, linear in the steps of a session, and of degree two in ``m``. Two costs are not in it: planning and
+smoothing, and normalising Eq. 6.5, which is a sum over observations for every class of truths. Here that is
+``O(C E (m + 1) + E m^2)`` a Newton step for ``C`` classes and ``E`` patterns of agreement, with ``E <=
+min(2^m, C^2)``: no polynomial in ``m`` until all pairs differ.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from ..harness import median_seconds, print_table, publish, seconds
 
 REPORTED = "RIMEO, stepwise"
 COUNTED = "RIFOM"
-# Of a report, that it is of any pair whatever.
+# Probability that an observation is any pair.
 ASTRAY = 0.1
 WARM = 3
 
@@ -80,7 +80,7 @@ class Growth(NamedTuple):
 
 
 def stream_of(task: NoisyTask, sessions: int, trajectories: int = 2, steps: int = 3, seed: int = 0) -> Stream:
-    """Scored reports of a noisy task."""
+    """Scored observations of a noisy task."""
     drawn = demonstrate_noisy(
         jax.random.key(seed),
         task,
@@ -96,8 +96,8 @@ def random_stream(size: int, predicates: int, sessions: int, *, named: bool = Fa
     """Simulate a grid of ``size x size`` cells, predicates of its pairs drawn by coin, observations with
     scores.
 
-    With ``named``, state and action are known by two labels besides, so that no two pairs are one class. A
-    tenth of the reports are of any pair; the expert is soft.
+    With ``named``, state and action have two further labels, so that every pair is a class of its own. A
+    tenth of the observations are of any pair; the expert is soft.
     """
     rng = np.random.default_rng(seed)
     world = random_object_world(jax.random.key(seed), size, 0, slip=0.1, discount=0.95)

@@ -3,7 +3,7 @@
 ``python -m i2rl.analysis.benchmarks.cost.sessions`` measures, on patrol instance 2 at 30 % observability:
 
 - IPOPT iterations of a session's programs (warm-started within the session and from the one before), and of
-  its last program from nothing;
+  its last program from a cold start;
 - the time of a session after 10 and after 1000 sessions, and the growth of memory in between;
 - the cumulative time of 239 online sessions against one batch run over all of them, and against batch
   re-run after every session;
@@ -35,7 +35,9 @@ from ..harness import print_table, publish, seconds
 
 
 def ipopt_iterations(sessions: int, seed: int = 0) -> dict[str, Any]:
-    """IPOPT iterations per program: as the learner solves it, and the session's last program from nothing."""
+    """Count IPOPT iterations per program: as the learner solves it, and the session's last program from a
+    cold start.
+    """
     patrol = instance(2)
     demonstration = demonstrate(jax.random.key(seed), patrol, 30, sessions)[0]
     result = {}
@@ -48,7 +50,7 @@ def ipopt_iterations(sessions: int, seed: int = 0) -> dict[str, Any]:
         for one in demonstration.sessions():
             state, report = learner.update(state, one)
             kept = state.statistic
-            # With these two statistics what is kept is what the last program was about.
+            # With these two statistics the state is the last program's data.
             if statistic == "features":
                 target = FeatureTarget(np.asarray(kept.features), np.asarray(kept.start))
                 solved = features.solve(target, slack / (1 - float(patrol.mdp.discount)))

@@ -5,8 +5,8 @@ Run as ``python -m i2rl.analysis.benchmarks.faults.fuzz``.
 Lines: lines of both formats are composed, with values now and then that JSON allows and readers must not,
 mutated (characters replaced, inserted, deleted and repeated) and given to every reader of lines, and rows of
 recordings of onions to theirs. Each line has to be read, or to end in the reader's own error, which names
-file and line in at most a few hundred printable characters. What is read has to be writable and to read back
-the same.
+file and line in at most a few hundred printable characters. Content that is read must be writable and read
+back the same.
 
 Archives: valid archives of processes are mutated byte by byte, and others are crafted to overwhelm or mislead
 a reader (bombs, lies about sizes, encryption, other compressions, objects, absurd shapes and headers). Each
@@ -64,9 +64,9 @@ class Tally(NamedTuple):
     ------
     inputs : int
     read : int
-        Accepted; the rest was refused by the reader's own error.
+        Accepted inputs; the reader refused the rest by its own error.
     problems : tuple of str
-        Whatever else happened, at most a hundred.
+        All other outcomes, at most a hundred.
     seconds : float
     peak : int
         Largest memory allocated while reading one of them, in bytes; -1 if it was not measured.
@@ -287,7 +287,7 @@ def _fuzzed(
 
 
 def largest_lines(limits: LineLimits = DEFAULT_LIMITS) -> dict[str, int]:
-    """Most memory allocated while reading lines of the size of the limit, in bytes, by what they hold."""
+    """Measure the most memory allocated while reading lines of the limit's size, in bytes, by content."""
     size, mdp = limits.size, tiny_process()
     lines = {
         "steps within the limit": json.dumps([{"s": "bin", "a": 1, "score": 0.5}] * limits.steps),
@@ -413,7 +413,7 @@ def _bomb(name: str, head: bytes, megabytes: int, others: dict[str, bytes], size
     """Write an archive with an array that inflates to so many zeros behind its head, and claims ``size``."""
     squeeze = zlib.compressobj(9, zlib.DEFLATED, -15)
     first = squeeze.compress(head) + squeeze.flush(zlib.Z_FULL_FLUSH)
-    # After a full flush blocks depend on nothing before them, and can be repeated.
+    # After a full flush blocks are independent of earlier ones, and can be repeated.
     block = squeeze.compress(bytes(2**20)) + squeeze.flush(zlib.Z_FULL_FLUSH)
     content = first + block * megabytes + squeeze.flush()
     size = len(head) + (megabytes << 20) if size is None else size
@@ -625,7 +625,7 @@ def _patched(content: bytes, offset: int, value: int) -> bytes:
 def fuzz_archives(contents: Iterable[tuple[str, bytes]], limit: int = LIMIT) -> Tally:
     """Load each archive with a limit, beyond which reading must not allocate memory.
 
-    Memory is what Python and NumPy allocate while the file is read and the process is built.
+    Memory is the allocation of Python and NumPy while the file is read and the process is built.
     """
     began, count, accepted, peak, problems = time.perf_counter(), 0, 0, 0, list[str]()
     with tempfile.TemporaryDirectory() as folder:

@@ -3,8 +3,8 @@
 Run as ``python -m i2rl.analysis.benchmarks.faults.journals``.
 
 A learner that needs no JAX, and whose state follows from the number of its session, commits a few sessions.
-Then it does so again in adversity. What that leaves is opened, shown, and learned on in to the end. The end
-has to be the bits of a journal that was left in peace.
+Then it does so again in adversity. The remaining journal is opened, shown, and learned on in to the end. The
+end must equal an undisturbed journal bit by bit.
 
 - Kills: SIGKILL at the first, second, ... call that writes, flushes, cuts or deletes one of the journal's
   files (``strace`` injects it), from creation to the folding in of the log. Each session is checkpointed, so
@@ -12,10 +12,10 @@ has to be the bits of a journal that was left in peace.
 - Full disks: the same with files that may grow to so many bytes only (``RLIMIT_FSIZE``), and on file systems
   of so many pages (a tmpfs, for root). Then there is room again.
 - Damage: random bits, cuts, swapped pages, noise, and rows deleted, exchanged or of other types. A damaged
-  journal is refused with :class:`JournalError`, or everything that it still shows is true.
+  journal is refused with :class:`JournalError`, or all that it shows is true.
 
-Kills and full disks are suffered by forked processes, and only afterwards is anything opened here: JAX, which
-opening a journal uses, does not outlive a fork.
+Forked processes suffer kills and full disks, and journals are opened here only afterwards: JAX, which opening
+a journal uses, does not survive a fork.
 """
 
 from __future__ import annotations

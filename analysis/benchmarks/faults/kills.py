@@ -1,24 +1,24 @@
-"""Killed at any instant, ``i2rl learn`` loses nothing: python -m i2rl.analysis.benchmarks.faults.kills.
+"""Kills of ``i2rl learn`` at any instant, without loss: python -m i2rl.analysis.benchmarks.faults.kills.
 
 A stream is learned from start to end several times over, each time (a life) into a journal of its own. The
 process is killed with SIGKILL again and again and started again with the same command, until the stream is
-learned. In the end every journal has to hold the bits of one that was written without interruption, and
-after each kill a copy of what is on disk has to hold whole sessions, all that were reported among them, with
-those very bits.
+learned. In the end every journal has to hold the bits of one that was written without interruption, and after
+each kill a copy of the files on disk has to hold whole sessions, all printed ones among them, with the same
+bits.
 
 A kill at a uniformly random time would nearly always hit the start, which takes seconds where a session takes
 milliseconds. So a life's kills are shared out over the phases, and are uniform in time within each:
 
 - starting: interpreter, imports, opening the journal, loading compiled code;
 - compiling: as a first run does, without the cache of compiled code that the other starts share;
-- sessions: at most two sessions' time after a random session, so that planning, solving, committing and
-  reporting are all met as often as they take time;
-- closing: after the last session, and once more in a run that finds nothing left to do.
+- sessions: at most two sessions' time after a random session, so that kills meet planning, solving,
+  committing and printing in proportion to their time;
+- closing: after the last session, and once more in a run without remaining sessions.
 
 Processes may be forked from one that has imported everything: a kill then costs about half of the time, and
 none of them meets the imports, during which no file is open.
 
-A kill ends the process and not the system: what power loss leaves is SQLite's matter and not measured here.
+A kill ends the process and not the system: power loss is SQLite's concern and not measured here.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Instant(NamedTuple):
 class Ended(NamedTuple):
     """End of a process: whether it was killed, its lines of output until then, and its seconds.
 
-    ``first`` and ``last`` are the times of its first and last report, NaN if there was none.
+    ``first`` and ``last`` are the times of its first and last line of output, NaN if there was none.
     """
 
     killed: bool
@@ -74,7 +74,7 @@ class Ended(NamedTuple):
 
 
 class Kill(NamedTuple):
-    """One kill: the phase it was meant for, the sessions reported by this process, committed, and before it.
+    """Kill: its intended phase, the sessions printed by this process, committed, and before it.
 
     ``problem`` says in words what a copy of the journal, taken right after the kill, had wrong.
     """
@@ -109,7 +109,7 @@ class Survival(NamedTuple):
 
 
 class Content(NamedTuple):
-    """A journal in bytes: ``sessions`` (number, weights, position in the input, report), and the state."""
+    """Journal in bytes: ``sessions`` (number, weights, position in the input, info), and the state."""
 
     sessions: list[tuple]
     state: list[tuple]
@@ -142,7 +142,7 @@ def _arrays(leaves: Mapping[str, Any]) -> Iterator[tuple[str, np.ndarray]]:
 
 
 class Started(Protocol):
-    """A learner that runs: what it prints, a line a session, and the power to kill it."""
+    """Running learner: its output, a line a session, and a handle to kill it."""
 
     @property
     def output(self) -> int:
@@ -200,7 +200,7 @@ def _cache(folder: Path) -> dict[str, Any]:
 
 
 class Forks:
-    """Processes forked from one that has imported everything, and has computed nothing."""
+    """Processes forked from one that has imported everything, before any computation."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
@@ -259,7 +259,7 @@ def _serve(folder: Path) -> None:
         arguments, cached = json.loads(request)
         if pid := os.fork():
             print(pid, flush=True)
-            sys.stdin.readline()  # until nobody kills it any more: its number is its own until it is reaped
+            sys.stdin.readline()  # until the last kill: its number is its own until it is reaped
             print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
             continue
         _become(folder, arguments, cached)
@@ -448,7 +448,9 @@ def _problem(found: Content, peace: Content, before: int, reports: int) -> str:
 
 
 def _table(kills: Sequence[Kill], sessions: int) -> list[tuple]:
-    """By phase: where the kills hit, how many between commit and report, and sessions committed by then."""
+    """Tabulate by phase: where the kills hit, how many between commit and output, and sessions committed by
+    then.
+    """
     rows: list[tuple] = []
     for phase in PHASES:
         these = [k for k in kills if k.phase == phase]

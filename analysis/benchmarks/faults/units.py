@@ -185,7 +185,7 @@ METHODS: Mapping[str, Callable[[TabularMDP], Array | np.ndarray]] = {
 }
 # Greedy experts, whose policy is not the soft one.
 GREEDY = ("mlirl", "em_mlirl", "dpm_birl", "birl", "jin_i2rl_with_features")
-# Samplers magnify the least difference: their units are powers of two, which round nothing.
+# Samplers magnify the least difference: their units are powers of two, which are exact.
 SAMPLERS = ("dpm_birl", "birl")
 
 

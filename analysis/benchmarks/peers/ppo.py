@@ -5,13 +5,13 @@ a table and writes every run to ``build/bench/ppo_peer.json``.
 
 Each side steps its own environments: ours the compiled cart-pole and MuJoCo's rollout of Hopper-v5, the peer
 Gymnasium's CartPole-v1 and Hopper-v4 (which differs by the one point for being healthy, which it pays in the
-step of a fall, too). Of each seed three mean returns: of all episodes of training, which says how
-quickly it went; of the last hundred of these; and of the policy's mode, in episodes of its own afterwards.
-The interval is of the mean over seeds, by Student's t at 95 %; Welch's, of the difference of the two means.
+step of a fall, too). Each seed has three mean returns: of all episodes of training, which measures its speed;
+of the last hundred of these; and of the policy's mode, in separate episodes afterwards. The interval is of
+the mean over seeds, by Student's t at 95 %; Welch's, of the difference of the two means.
 
 Each side runs in a process of its own, with one thread, pinned to one core, and the runs alternate. Ours is
-timed once compiled (what compiling takes is reported beside it); the peer over ``PPO.learn``. Where the core
-is shared with other work, the seconds of the processor tell more than those of the wall.
+timed once compiled (compilation is listed beside it); the peer over ``PPO.learn``. If the core is shared with
+other work, processor seconds are more reliable than wall seconds.
 """
 
 from __future__ import annotations

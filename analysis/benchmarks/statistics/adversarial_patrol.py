@@ -1,17 +1,17 @@
-"""AIRL on patrol through reports that err, and GAIL on patrol through a view that hides (7.4.3 and 7.4.1).
+"""AIRL on patrol with noisy observations, and GAIL on patrol with hidden steps (7.4.3 and 7.4.1).
 
 ``python -m i2rl.analysis.benchmarks.statistics.adversarial_patrol`` writes
 ``build/bench/adversarial_patrol.json`` and, beside it, figures (``patrol-view`` is to be seen beside Figure
 7.4(c)):
 
 - *noise*: instance 2, its greedy expert (the dissertation's is a rule by hand), trajectories of 8 pairs from
-  anywhere, sessions of 32 to 128 pairs. Moving forward is reported as turning left, and turning right as
-  moving forward; states are never wrong. LBA after every session of AIRL on the truth, of AIRL and
-  robust-AIRL on the reports, with the sensor given or learned, and of LME-I2RL on the same reports, which
-  knows the six features that the expert's reward is made of. AIRL learners with and without memory of
-  earlier sessions. How often each final policy leads past the patrollers unseen.
+  anywhere, sessions of 32 to 128 pairs. Moving forward is observed as turning left, and turning right as
+  moving forward; states are always right. LBA after every session of AIRL on the truth, of AIRL and
+  robust-AIRL on the observations, with the sensor given or learned, and of LME-I2RL on the same observations,
+  with the six features of the expert's reward. AIRL learners with and without memory of earlier sessions.
+  Success of each final policy in passing the patrollers undetected.
 - *view*: the same patrol, sessions of one trajectory of 5 pairs for each patroller, at three degrees of
-  observability; online GAIL on what was seen, GAIL on the posterior of what was hidden too, and LME-I2RL.
+  observability; online GAIL on the steps seen, GAIL on the posterior of the hidden steps too, and LME-I2RL.
 
 Parts and methods that the file already holds are not measured again.
 """
@@ -70,7 +70,9 @@ WINDOW = 5
 
 
 def view_streams(patrol: Patrol, view: int, replications: int, sessions: int, seed: int = 0) -> Demonstration:
-    """Windows of both patrollers of each run, ``[replications * patrollers, sessions, 1, WINDOW]``."""
+    """Simulate windows of both patrollers of each replication, ``[replications * patrollers, sessions, 1,
+    WINDOW]``.
+    """
     keys = jax.random.split(jax.random.key(seed), replications)
     rows = [d for key in keys for d in demonstrate(key, patrol, view, sessions, WINDOW)]
     return Demonstration(

@@ -10,7 +10,7 @@
 - *soft*: one or two experts who obey the soft model (true weights times a sharpness), ``temperature`` 0.5 and
   1.
 
-How many ways are found, value differences and run times beside the baselines: ``i2rl run sorting``.
+``i2rl run sorting`` measures numbers of components, value differences and times beside the baselines.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def shuffled(key: jax.Array, mixed: MixedDemonstration) -> MixedDemonstration:
 def run_online(
     learner: Learner, key: jax.Array, demonstration: Demonstration, size: int
 ) -> tuple[Any, list[Any]]:
-    """Feed sessions of ``size`` trajectories; the final state and all reports."""
+    """Feed sessions of ``size`` trajectories; return the final state and all infos."""
     state, reports = learner.init(key), []
     for session in demonstration.sessions(size):
         state, report = learner.update(state, session)

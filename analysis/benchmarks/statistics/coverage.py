@@ -1,9 +1,9 @@
-"""Coverage and looseness of every bound, and how many trajectories each asks for.
+"""Coverage and looseness of every bound, and its number of trajectories.
 
-``python -m i2rl.analysis.benchmarks.statistics.coverage`` repeats simulated replications on a random MDP and
-on patrol 2 (an expert who obeys the soft model of the patrol's true weights), and reports in what share of
-them each bound holds, how many times larger it is than the quantile seen, and the number of trajectories that
-Theorem 2 (Theorem 4 of appendix B) and the tighter bounds need for the rows of Table 7.1(a).
+``python -m i2rl.analysis.benchmarks.statistics.coverage`` simulates replications on a random MDP and on
+patrol 2 (an expert who obeys the soft model of the patrol's true weights), and prints the share of them in
+which each bound holds, its ratio to the quantile observed, and the number of trajectories that Theorem 2
+(Theorem 4 of appendix B) and the tighter bounds need for the rows of Table 7.1(a).
 """
 
 from __future__ import annotations

@@ -1,11 +1,11 @@
-"""The truth behind a noisy pendulum by Gibbs sampling, by smoothing and by particles.
+"""Truth behind a noisy pendulum by Gibbs sampling, by smoothing and by particles.
 
 ``python -m i2rl.analysis.benchmarks.statistics.gibbs`` draws trajectories of a damped pendulum with a torque
-at four settings of process and sensor noise, among them one where the noise of the reports is large against
-that of the process and single steps hardly move. :class:`GaussianGibbs` and the smoother are compared with a
-referee that shares nothing with them: a bootstrap particle filter with backward simulation (Godsill, Doucet
-and West 2004). Differences of posterior means are in the referee's standard deviations, the largest over all
-steps and components. Fails if Gibbs differs from the referee by more than ``TOLERANCE``.
+at four settings of process and sensor noise, among them one with observation noise that is large against the
+process noise, where single steps hardly move. :class:`GaussianGibbs` and the smoother are compared with an
+independent referee: a bootstrap particle filter with backward simulation (Godsill, Doucet and West 2004).
+Differences of posterior means are in the referee's standard deviations, the largest over all steps and
+components. Fails if Gibbs differs from the referee by more than ``TOLERANCE``.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ PENDULUM, POLICY = jax_dynamics(pendulum), Torque(jnp.array([[-0.3, 0.5]]))
 
 
 def problem(seed: int, process: float, sensor: GaussianSensor, steps: int) -> Recording:
-    """Draw a trajectory from the model and report it."""
+    """Draw a trajectory from the model and its observation."""
     rng = np.random.default_rng(seed)
     s, pairs = jnp.asarray(rng.normal(size=(1, 2))), []
     for _ in range(steps):

@@ -3,11 +3,11 @@
 ``python -m i2rl.analysis.benchmarks.statistics.mixture`` asks two questions of NUTS (assignments summed out)
 and of Gibbs sampling over assignments (Neal's algorithm 8):
 
-- Do they draw from the same posterior? Moments that do not depend on what the ways are called are compared
+- Do they draw from the same posterior? Moments that are invariant to the order of the components are compared
   over several mixtures, each difference in units of its Monte-Carlo standard error.
 - Is it the posterior of the declared model? Simulation-based calibration (Talts et al. 2018) of each, as
-  :mod:`~i2rl.analysis.benchmarks.statistics.calibration` does for one way: mixtures drawn from the prior
-  generate demonstrations, and the truth's rank among the draws must be uniform. The public samplers are
+  :mod:`~i2rl.analysis.benchmarks.statistics.calibration` does for one component: mixtures drawn from the
+  prior generate demonstrations, and the truth's rank among the draws must be uniform. The public samplers are
   called, their starts and output included.
 """
 
@@ -79,7 +79,7 @@ class Comparison(NamedTuple):
 
 
 class Mixtures(NamedTuple):
-    """Draws from the prior, and the ways and codes of the demonstrations that they generated."""
+    """Prior draws, and the components and codes of the demonstrations that they generated."""
 
     weights: Float[Array, "R T K"]
     proportions: Float[Array, "R T"]
@@ -153,7 +153,9 @@ def draw_mixtures(key: Array, replications: int, setting: Setting, components: i
 
 
 def moments(idata: az.InferenceData) -> dict[str, Float[np.ndarray, "chain draw"]]:
-    """Draws of quantities whatever the ways are called; their means are the moments compared."""
+    """Compute draws of quantities that are invariant to the order of the components; their means are
+    compared.
+    """
     invariant, components = label_invariant(idata), idata["assignments"].assignment.values
     found = {
         f"trajectories {i} and {j} together": components[..., i] == components[..., j]
@@ -360,7 +362,7 @@ def main() -> None:
 
     setting = small_mixture(trajectories=5, length=6, components=5)
     shared["components"] = setting.components
-    # Chains long enough that draws kept are close to independent.
+    # Chains long enough that thinned draws are close to independent.
     calibrated: dict[str, tuple[Array, Sampler, int]] = {
         "Gibbs": (
             gibbs_key,

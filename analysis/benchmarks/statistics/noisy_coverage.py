@@ -1,14 +1,15 @@
 """Coverage of intervals of the joint posterior over weights and reliabilities.
 
 ``python -m i2rl.analysis.benchmarks.statistics.noisy_coverage`` draws weights and reliabilities from the
-model's own prior, lets a soft expert of those weights be reported through :class:`FeatureNoise` of those
+model's own prior, observes a soft expert of those weights through :class:`FeatureNoise` of those
 reliabilities, and samples the joint posterior by NUTS. Intervals of probability 0.9 then cover the truth in
 90 % of the replications, and the truth's rank among the draws is uniform (Cook, Gelman and Rubin 2006; Talts
-et al. 2018), if model, simulation and sampler agree. That holds on average over the prior, whether or not the
-data tell sloppy experts from sloppy sensors: it says nothing of what is identified, nor of any one truth.
+et al. 2018), if model, simulation and sampler agree. That holds on average over the prior, also if the data
+do not separate sloppy experts from sloppy sensors: it is no statement about identification or about a single
+truth.
 
 Reliabilities come from the model's default, Beta(4, 1), perception being more often right than wrong. With
-``--uniform`` ones a predicate reported wrongly, and weights of the other sign, explain almost as well: a
+``--uniform`` ones a predicate observed wrongly, and weights of the other sign, explain almost as well: a
 second mode, which chains seldom reach from the first.
 """
 
@@ -101,11 +102,11 @@ class CoverageStudy(NamedTuple):
     ------
     quantities : tuple of str ``[Q]``
     covered : bool ``[R, Q]``
-        By the central interval of probability 0.9.
+        Coverage by the central interval of probability 0.9.
     jointly_covered : bool ``[R]``
-        By the region of highest joint density of that probability.
+        Coverage by the region of highest joint density of that probability.
     ranks : int ``[R, Q]``
-        Of the truth among ``kept`` draws, equally far apart.
+        Rank of the truth among ``kept`` draws, equally far apart.
     kept : int
     r_hat, ess : float ``[R, Q]``
         Rank-normalised R-hat and bulk effective sample size.
@@ -162,10 +163,10 @@ def corridor(reliability_prior: dist.Distribution | None = None) -> NoisySetting
 
 
 def sorting(reliability_prior: dist.Distribution | None = None) -> NoisySetting:
-    """Noisy sorting, six sessions of two trajectories of three steps that start anywhere.
+    """Make noisy sorting, six sessions of two trajectories of three steps that start anywhere.
 
-    Two pairs of its eight predicates are one function, and some features never occur: nothing but priors
-    tells their parameters apart.
+    Two pairs of its eight predicates are one function, and some features never occur: only priors determine
+    their parameters.
     """
     task = noisy_sorting()
     return NoisySetting(
@@ -198,7 +199,7 @@ def replicate(
 
 def _template(setting: NoisySetting) -> NoisyProblem:
     """Compile the problem that all replications share: the setting's priors, a row for each trajectory."""
-    # Any report is possible of any truth, so one will do for the checks.
+    # Every observation is possible for every truth, so one suffices for the checks.
     report = Demonstration.from_pairs(np.zeros((1, 1), int), np.zeros((1, 1), int))
     problem, _ = noisy_problem(
         setting.mdp,
@@ -288,7 +289,7 @@ def covers(
 def rank_among(
     draws: Float[np.ndarray, "D Q"], truth: Float[np.ndarray, " Q"], kept: int
 ) -> Int[np.ndarray, " Q"]:
-    """Rank of each truth, from 0 to ``kept``, among as many draws equally far apart.
+    """Rank each truth, from 0 to ``kept``, among as many draws equally far apart.
 
     Raises ``ValueError`` for more draws than there are.
     """

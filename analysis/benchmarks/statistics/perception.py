@@ -1,8 +1,8 @@
-"""RIMEO's bounds under noisy perception: how often they hold, how loose they are, and what they ask for.
+"""RIMEO's bounds under noisy perception: coverage, looseness and data required.
 
-``python -m i2rl.analysis.benchmarks.statistics.perception`` repeats simulated replications on two small tasks
-whose predicates can be reported independently, and on the proof's step alone also on onion sorting, where
-they cannot. Hidden pairs are filled in under the expert's weights, then under the learner's own, at several
+``python -m i2rl.analysis.benchmarks.statistics.perception`` simulates replications on two small tasks whose
+predicates are observed independently, and of the proof's step alone also on onion sorting, where they are
+dependent. Hidden pairs are filled in under the expert's weights, then under the learner's own, at several
 reliabilities.
 """
 

@@ -11,8 +11,7 @@ true weights, which lie in [0, 1]^K:
     The same with 5 steps a trajectory: 95 % of the features are the learner's own guess.
 ``everyday``
     30 % in view, 5 steps a trajectory, the default statistic. Trajectories are independent here too: this
-    expert strolls, and half of its long walks stay out of view for hundreds of steps, where there is
-    nothing to learn from.
+    expert strolls, and half of its long walks stay out of view for hundreds of steps, without evidence.
 ``greedy``
     The same view of patrollers who never err, and who meet; consecutive fragments of one walk. No weights
     have their policy as a soft policy, so the risk is never 0.

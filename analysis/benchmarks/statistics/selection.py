@@ -101,7 +101,7 @@ def main() -> None:
         for seed in range(options.replications):
             began = time.perf_counter()
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of Pareto shapes, which are reported
+                warnings.simplefilter("ignore")  # of Pareto shapes, which are printed
                 compared = compare_features(
                     jax.random.fold_in(jax.random.key(seed), EXPERTS.index(expert)),
                     sets,

@@ -1,17 +1,17 @@
 """Stopping rules on 200 streams of the second patrol instance: false stops, and sessions saved.
 
 30 % in view, consecutive fragments of five steps, a session each; the first patroller of each run, so that
-streams are independent. All rules see the same reports. A false stop is defined in
+streams are independent. All rules see the same infos. A false stop is defined in
 :mod:`i2rl.analysis.bounds.stopping`: stopped although the learned behaviour was still worse, by more than 5
-points of LBA, than what the stream settles at, the mean of its last 24 sessions. Other margins (2 and 10
-points) are measured to see whether the verdict hinges on it.
+points of LBA, than the mean of the stream's last 24 sessions. Other margins (2 and 10 points) are measured to
+see whether the verdict hinges on it.
 
 Two controls. A window of ``w`` sessions cannot fire before session ``w``: ``fixed number`` stops every stream
-after ``n`` sessions without looking. And the single-step rules are the windows' own, of width two in effect.
+after ``n`` sessions without data. And the single-step rules are the windows' own, of width two in effect.
 
-The width of a window is what decides. For up to 10 sessions on end nothing is in view (the loop has 56
-steps), the learner's quantities stand still for want of data, and a rule that looks at fewer sessions takes
-that for convergence.
+The width of a window determines the result. For up to 10 sessions in a row no step is in view (the loop has
+56 steps), the learner's quantities stand still for want of data, and a rule over fewer sessions takes that
+for convergence.
 
 Run as ``python -m i2rl.analysis.benchmarks.statistics.stopping``; ``--reuse`` judges the streams of the last
 run again.

@@ -166,8 +166,8 @@ two corners, deterministic moves. The law of maximum entropy makes a trajectory'
 less a constant, so the two correlate perfectly for every expert.
 
 Bayesian IRL normalises over actions in every state. Its log-likelihood is the sum of advantages times \
-the rationality, which grows with the reward, less the cost of the choices on the path, and at an object in a corner there \
-are most equally good choices: a move against either edge stays, too. The two pull in \
+the rationality, which grows with the reward, less the cost of the choices on the path, and at an object \
+in a corner there are most equally good choices: a move against either edge stays, too. The two pull in \
 opposite directions, and the result depends on the experts' rationality.
 
 With exp(Q) as the dissertation writes it (rationality 1), a discount of {DISCOUNT:g}, \

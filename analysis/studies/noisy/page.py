@@ -342,8 +342,8 @@ of {TRAJECTORIES} trajectories of {STEPS} pairs; observations and calibrated sco
 every method.
 
 {bare}The sensor is judged by agreement probabilities: how often a predicate of an observation is that of \
-the truth. The reliabilities that parametrise the sensor are no frequencies. Controls: the constant one half; \
-observations compared with the truth (oracle); observations taken for truths (observed, RIFOM); the \
+the truth. The reliabilities that parametrise the sensor are not frequencies. Controls: the constant one \
+half; observations compared with the truth (oracle); observations taken for truths (observed, RIFOM); the \
 program as printed (all).
 
 {CLEAR!r} learns from the truth. Methods with a known sensor or without one have the same ridge and \

@@ -492,7 +492,8 @@ def _lead(study: Study) -> Lead:
     whose = "the patroller's reward" if len(study.determined) == 1 else "the rewards of both patrollers"
     learned = (
         f"From {counted(study.sessions, 'session')} with {study.observability} % of {study.patrol.name} in "
-        f"view, {first.name} learned {whose}: the best policy of what was learned does as the expert in "
+        f"view, {first.name} learned {whose}: the optimal policy of the learned weights agrees with the "
+        "expert in "
         f"{number(100 * row['LBA'])} % of the states and loses {_lost(row['ILE'])} of the value."
     )
     vague = sum(len(found.directions) for found in study.determined)
@@ -505,7 +506,7 @@ def _lead(study: Study) -> Lead:
     )
     reach = _share_as_good(study)
     trust = (
-        f"That accuracy is no evidence, since {_percent(reach, 0)} of random weights reach it as well; "
+        f"That accuracy is weak evidence, since {_percent(reach, 0)} of random weights reach it as well; "
         "trust the likelihood of fresh demonstrations instead, "
         if reach > 0.05
         else f"Chance does not explain the accuracy, since {_percent(reach, 1)} of random weights reach it, "
@@ -540,13 +541,13 @@ def _text(study: Study) -> str:
 
 Chance: of {counted(len(study.chance), "weight vector")} drawn at random, half have an LBA of at least \
 {_percent(median)}, and {_percent(_share_as_good(study))} have the {_percent(float(reached))} of \
-{first.name} or more. The row of random weights is one such draw a patroller and replication.
+{first.name} or more. The row of random weights is one draw a patroller and replication.
 
-Likelihood: it is that of a policy which errs the less the longer its weights are, and the patrollers never \
-err. The true weights are given in no such units. As given they reach {number(study.truth.as_given)} nats a \
+Likelihood: it is that of a policy that errs less for longer weights, and the patrollers never err. The true \
+weights have arbitrary units. As given they reach {number(study.truth.as_given)} nats a \
 trajectory, stretched {number(stretched)} times {number(best)}, and {first.name} {number(learned)}. Learned \
-weights maximise the likelihood of what was seen, their length included; the true weights do not maximise it, \
-so that a likelihood above theirs is no error."""
+weights maximise the likelihood of the observations, their length included; the true weights do not, so a \
+likelihood above theirs is consistent."""
 
 
 def write(study: Study, folder: Path | str) -> Path:
@@ -573,7 +574,7 @@ def write(study: Study, folder: Path | str) -> Path:
             lambda theme: hidden_path(
                 study.patrol, study.stretch.posterior, study.stretch.seen, study.stretch.path, theme=theme
             ),
-            "A stretch of patrol nobody learned from: belief about the hidden steps, given the seen ones.",
+            "A stretch of patrol outside the training data: belief about its hidden steps.",
             "Probability of each cell over time, with the true path",
         ),
     ]
@@ -618,7 +619,7 @@ def write(study: Study, folder: Path | str) -> Path:
     sections = [Section("Results", _text(study), [_results_table(study)], pictures)]
     if study.determined:
         sections.append(identifiability_section(_by_patroller(study)))
-    title = f"What {study.patrol.name}'s patrollers want"
+    title = f"Rewards of {study.patrol.name}'s patrollers"
     return write_page(folder, title, _lead(study), sections, summary(study))
 
 
