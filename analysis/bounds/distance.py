@@ -29,7 +29,9 @@ class Perception(NamedTuple):
     longest: int
 
 
-def report_distance(perception: Perception, reliabilities: Float[np.ndarray, " J"] | None = None) -> float:
+def observation_distance(
+    perception: Perception, reliabilities: Float[np.ndarray, " J"] | None = None
+) -> float:
     """Bound the distance between observations of one trajectory under true and estimated reliabilities.
 
     Total variation, at most ``1 - (1 - epsilon_o)^(L |Psi|) <= L |Psi| epsilon_o`` (a coupling of the

@@ -49,9 +49,9 @@ def noise_of(setting: Setting) -> FeatureNoise:
 
 
 def counted_reliabilities(
-    key: Array, noise: FeatureNoise, replications: int, reports: int
+    key: Array, noise: FeatureNoise, replications: int, observations: int
 ) -> Float[Array, "replications J"]:
-    """Count the shares of ``reports`` observations of known truth that have each predicate right.
+    """Count shares of right predicates among ``observations`` of known truth.
 
     Shares stay half an observation away from 0 and 1. Raises ``ValueError`` unless predicates are observed
     independently, which requires that every combination of them can be observed, equally often.
@@ -64,8 +64,8 @@ def counted_reliabilities(
             f"{classes.reportable.max():g} pairs: predicates are not independent, and reliabilities no shares"
         )
     p = noise.reliabilities
-    right = jax.random.binomial(key, reports, p, (replications, len(p)))
-    return jnp.clip(right, 0.5, reports - 0.5) / reports
+    right = jax.random.binomial(key, observations, p, (replications, len(p)))
+    return jnp.clip(right, 0.5, observations - 0.5) / observations
 
 
 @partial(jax.jit, static_argnames=("draws",))
@@ -90,20 +90,20 @@ def complete_under(
 
 
 def perception_coverage(
-    key: Array, setting: Setting, replications: int, size: int, draws: int, reports: int, delta: float
+    key: Array, setting: Setting, replications: int, size: int, draws: int, observations: int, delta: float
 ) -> list[Coverage]:
     """Simulate Lemma 4 and Theorem 6 (Lemma 8 and Theorem 6 of appendix E), printed and corrected.
 
     ``delta`` is spent on each of ``epsilon`` (``size`` trajectories), ``epsilon_s`` (``size * draws`` sampled
-    completions in all) and ``epsilon_o`` (``reports``), which determine the errors. Hidden pairs are filled
-    in under the expert's weights. Raises ``ValueError`` as :func:`counted_reliabilities`.
+    completions in all) and ``epsilon_o`` (``observations``), which determine the errors. Hidden pairs are
+    filled in under the expert's weights. Raises ``ValueError`` as :func:`counted_reliabilities`.
     """
     mdp, discount, n_features = setting.mdp, float(setting.mdp.discount), setting.mdp.n_features
     noise, expert = noise_of(setting), expert_of(mdp, setting.weights)
     n_predicates = len(noise.predicates)
     walk, count, fill = jax.random.split(key, 3)
     codes = simulate_codes(walk, mdp, expert, noise.noise, setting.length, replications, size)
-    counted = counted_reliabilities(count, noise, replications, reports)
+    counted = counted_reliabilities(count, noise, replications, observations)
     completed = complete_under(fill, mdp, expert, noise, counted, codes, draws)
     epsilon, epsilon_s = error_for(size, delta, n_features), error_for(size * draws, delta, n_features)
 
@@ -125,7 +125,7 @@ def perception_coverage(
 
     # The printed delta_o counts every feature.
     printed = Perception(
-        reports, error_for(reports, delta, n_features * n_predicates), n_predicates, setting.length
+        observations, error_for(observations, delta, n_features * n_predicates), n_predicates, setting.length
     )
     sizes = (size, size * draws, epsilon, epsilon_s, printed, n_features)
     lemma, theorem = rimeo_constraint_bound(*sizes), rimeo_confidence(*sizes, discount)
@@ -136,7 +136,7 @@ def perception_coverage(
         jnp.full(replications, lemma.error),
         jnp.full(replications, theorem.error),
     )
-    once = printed._replace(epsilon_o=error_for(reports, delta, n_predicates))
+    once = printed._replace(epsilon_o=error_for(observations, delta, n_predicates))
     ahead = noisy_constraint_bound(size, epsilon, once, n_features)
     for name, lemmas in (
         ("corrected", [ahead] * replications),
@@ -166,7 +166,7 @@ def learned_perception_coverage(
     replications: int,
     size: int,
     draws: int,
-    reports: int,
+    observations: int,
     delta: float,
     shift: float = 1.0,
 ) -> list[Coverage]:
@@ -182,7 +182,7 @@ def learned_perception_coverage(
     noise = noise_of(setting)
     n_predicates = len(noise.predicates)
     perception = Perception(
-        reports, error_for(reports, delta, n_features * n_predicates), n_predicates, setting.length
+        observations, error_for(observations, delta, n_features * n_predicates), n_predicates, setting.length
     )
     epsilon, epsilon_s = error_for(size, delta, n_features), error_for(size * draws, delta, n_features)
     theorem = rimeo_confidence(size, size * draws, epsilon, epsilon_s, perception, n_features, discount)

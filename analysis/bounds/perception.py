@@ -72,7 +72,7 @@ from .assumptions import (
     Bound,
 )
 from .checks import counted, counted_sessions, discounted, positive, probability
-from .distance import Perception, posterior_distance, report_distance
+from .distance import Perception, observation_distance, posterior_distance
 from .theorems import (
     Regret,
     failure_probability,
@@ -126,7 +126,7 @@ def noisy_constraint_bound(
     ``phi_hat`` is the posterior's, exact or of independent draws from it, under the expert's weights and
     reliabilities counted on ``n_o`` other observations of known truth.
     """
-    distance = report_distance(perception, reliabilities)
+    distance = observation_distance(perception, reliabilities)
     return _corrected(size, epsilon, distance, perception, n_features, (OTHER_REPORTS,))
 
 
@@ -216,7 +216,7 @@ def perception_needed(
     """Compute the data for ``(1 - gamma) |E[phi_k] - phi_hat_k| <= error``, as printed and corrected.
 
     The terms share ``error`` and the rest of ``confidence`` equally. Returns a table with rows ``printed``
-    and ``corrected`` and columns ``trajectories``, ``draws`` (of completions), ``reports`` (``n_o``) and
+    and ``corrected`` and columns ``trajectories``, ``draws`` (of completions), ``observations`` (``n_o``) and
     ``epsilon_o``. Raises ``ValueError`` for an error outside (0, 1], a confidence outside (0, 1), or counts
     below 1.
     """
@@ -231,7 +231,7 @@ def perception_needed(
         ("printed", math.ceil(share), math.ceil(share), math.ceil(known[0]), printed),
         ("corrected", math.ceil(half), 0, math.ceil(known[1]), corrected),
     ]
-    columns = ["bound", "trajectories", "draws", "reports", "epsilon_o"]
+    columns = ["bound", "trajectories", "draws", "observations", "epsilon_o"]
     return pd.DataFrame(rows, columns=columns).set_index("bound")
 
 
@@ -242,7 +242,7 @@ def rimeo_no_regret(
     c: float,
     session_sizes: Int[np.ndarray, " T"] | Sequence[int],
     session_samples: Int[np.ndarray, " T"] | Sequence[int],
-    session_reports: Int[np.ndarray, " T"] | Sequence[int],
+    session_observations: Int[np.ndarray, " T"] | Sequence[int],
     predicates: int,
     longest: int,
     n_features: int,
@@ -253,7 +253,7 @@ def rimeo_no_regret(
 
     The relaxation is spent in thirds on ``epsilon``, ``epsilon_s`` and ``L |Psi| epsilon_o`` (the
     dissertation leaves it open). ``session_sizes [T]`` are the trajectories of each session,
-    ``session_samples [T]`` the draws ``n_s`` in it, ``session_reports [T]`` the observations it adds to
+    ``session_samples [T]`` the draws ``n_s`` in it, ``session_observations [T]`` the observations it adds to
     ``n_o``. The remarks of :func:`~i2rl.analysis.bounds.theorems.no_regret` on ``log T``, products and
     growing sessions hold for all three, see :func:`rimeo_no_regret_sizes`. Besides, ``phi_hat`` averages over
     sessions (Eq. 6.9), of which the early ones were completed with the early models: for ``epsilon_{o,i}``
@@ -264,10 +264,11 @@ def rimeo_no_regret(
     plain = no_regret(c, session_sizes, n_features, discount)
     i = np.arange(1, len(plain.average) + 1)
     third = c * (1 - discount) / i / 3
-    draws, reports = counted_sessions(session_samples), counted_sessions(session_reports)
-    if not len(draws) == len(reports) == len(i):
+    draws, observations = counted_sessions(session_samples), counted_sessions(session_observations)
+    if not len(draws) == len(observations) == len(i):
         raise ValueError(
-            f"{len(i)} session sizes, but {len(draws)} numbers of samples and {len(reports)} of reports"
+            f"{len(i)} session sizes, but {len(draws)} numbers of samples "
+            f"and {len(observations)} of observations"
         )
     epsilon_o = third / (longest * predicates)
     delta = (
@@ -276,7 +277,7 @@ def rimeo_no_regret(
         * (
             np.exp(-2 * np.cumsum(counted_sessions(session_sizes)) * third**2)
             + np.exp(-2 * draws * third**2)
-            + predicates * np.exp(-2 * np.cumsum(reports) * epsilon_o**2)
+            + predicates * np.exp(-2 * np.cumsum(observations) * epsilon_o**2)
         )
     )
     confidence = np.cumprod(np.maximum(0.0, 1 - delta))
@@ -309,7 +310,7 @@ def rimeo_no_regret_sizes(
         {
             "trajectories": np.diff(np.ceil(size), prepend=0).astype(int),
             "draws": np.ceil(size).astype(int),
-            "reports": np.diff(np.ceil(known), prepend=0).astype(int),
+            "observations": np.diff(np.ceil(known), prepend=0).astype(int),
         },
         index=pd.Index(i, name="session"),
     )

@@ -193,7 +193,7 @@ def _print_perception(needed: pd.DataFrame, console: Console) -> None:
     for row in needed.itertuples():
         draws = str(row.draws) if row.draws else "none"
         table.add_row(
-            names[row.Index], str(row.trajectories), draws, str(row.reports), f"{row.epsilon_o:.3g}"
+            names[row.Index], str(row.trajectories), draws, str(row.observations), f"{row.epsilon_o:.3g}"
         )
     console.print(table)
     console.print(

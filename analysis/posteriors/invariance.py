@@ -63,7 +63,7 @@ class Direction(NamedTuple):
 
 
 def unidentified_directions(
-    mdp: TabularMDP, shown: Bool[np.ndarray, " S"] | None = None
+    mdp: TabularMDP, visited: Bool[np.ndarray, " S"] | None = None
 ) -> tuple[Direction, ...]:
     """Find the directions that change no policy at any reachable state, in sparse, named form.
 
@@ -74,23 +74,23 @@ def unidentified_directions(
     ----------
     mdp : TabularMDP
         With discount below 1.
-    shown : bool ``[S]``, optional
+    visited : bool ``[S]``, optional
         States where the demonstrations may have been. Directions that matter only at states unreachable from
         those are *not visited*.
 
     Raises
     ------
     ValueError
-        For discount 1, or ``shown`` of the wrong shape or empty.
+        For discount 1, or ``visited`` of the wrong shape or empty.
     """
     require_discounted(mdp)
-    if shown is not None and (np.shape(shown) != (mdp.n_states,) or not np.any(shown)):
+    if visited is not None and (np.shape(visited) != (mdp.n_states,) or not np.any(visited)):
         raise ValueError(
             f"shown must mark at least one of {mdp.n_states} states in a boolean array [{mdp.n_states}], "
-            f"got shape {np.shape(shown)} with {np.count_nonzero(shown)} marked"
+            f"got shape {np.shape(visited)} with {np.count_nonzero(visited)} marked"
         )
     reachable = reachable_states(mdp)
-    onward = reachable if shown is None else reachable_states(mdp, np.asarray(shown, float))
+    onward = reachable if visited is None else reachable_states(mdp, np.asarray(visited, float))
     available = np.asarray(mdp.available)
     pairs = available & reachable[:, None]
     features = np.asarray(mdp.features)

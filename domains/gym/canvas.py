@@ -76,18 +76,20 @@ class Scene:
         self._mdp, self._place, self._columns = mdp, place, columns
         self._backdrop = Backdrop(axes, moving)
 
-    def frame(self, shown: Frame) -> UInt8[np.ndarray, "height width 3"]:
+    def frame(self, content: Frame) -> UInt8[np.ndarray, "height width 3"]:
         """Draw a state."""
-        self._place(shown.state)
-        return self._backdrop.picture(caption(self._mdp, shown, self._columns))
+        self._place(content.state)
+        return self._backdrop.picture(caption(self._mdp, content, self._columns))
 
 
-def caption(mdp: TabularMDP, shown: Frame, columns: int = 10_000) -> str:
+def caption(mdp: TabularMDP, content: Frame, columns: int = 10_000) -> str:
     """Write the last action and its reward, and the state reached, in lines of at most so many characters."""
     last = (
-        "begins" if shown.action is None else f"{mdp.action_names[shown.action]}, reward {shown.reward:.3g}"
+        "begins"
+        if content.action is None
+        else f"{mdp.action_names[content.action]}, reward {content.reward:.3g}"
     )
-    return f"{fill(last, columns)}\n{fill(mdp.state_names[shown.state], columns)}"
+    return f"{fill(last, columns)}\n{fill(mdp.state_names[content.state], columns)}"
 
 
 def new_canvas(

@@ -315,9 +315,9 @@ def demonstration_of(maze: Labyrinth, bouts: Sequence[Bout]) -> Demonstration:
     return concatenate([Demonstration.from_pairs(*pairs_of(maze, bout.nodes)) for bout in bouts])
 
 
-def conceal(demonstration: Demonstration, view: Visibility) -> Demonstration:
+def conceal(demonstration: Demonstration, visibility: Visibility) -> Demonstration:
     """Hide the steps in states that a view (a mask) does not cover; they stay in place, as hidden steps."""
-    covered = np.asarray(view.in_view) > 0
+    covered = np.asarray(visibility.in_view) > 0
     kind = np.asarray(demonstration.kind)
     hidden = (kind == SEEN) & ~covered[demonstration.state]
     return Demonstration(

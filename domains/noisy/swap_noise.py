@@ -74,24 +74,26 @@ class SwapNoise(_SwapFields):
         chosen = _subsets(m)
         weights = jnp.prod(jnp.where(chosen, self.chances, 1 - self.chances), axis=1)
         table = jnp.zeros((size, size))
-        for weight, report in zip(weights, self._reports(), strict=True):
-            table = table.at[jnp.arange(size), report].add(weight)
+        for weight, observation in zip(weights, self._observations(), strict=True):
+            table = table.at[jnp.arange(size), observation].add(weight)
         return ObservationModel._make((jnp.log(table).reshape(*shape, *shape),))
 
-    def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
+    def confused(self, truth: Int[Array, " n"], observation: Int[Array, " n"]) -> Bool[Array, "n M"]:
         """Find the swaps that turned each truth into its observation (flat indices); none if no swaps do."""
         # The first subset that explains an observation holds no swap without effect.
-        return jnp.asarray(_subsets(len(self.chances)))[(self._reports()[:, truth] == report).argmax(0)]
+        return jnp.asarray(_subsets(len(self.chances)))[
+            (self._observations()[:, truth] == observation).argmax(0)
+        ]
 
-    def _reports(self) -> Int[Array, "2**M S*A"]:
+    def _observations(self) -> Int[Array, "2**M S*A"]:
         flat = self.swaps.reshape(len(self.chances), -1)
-        reports = []
+        observations = []
         for subset in _subsets(len(self.chances)):
-            report = jnp.arange(flat.shape[1])
+            observation = jnp.arange(flat.shape[1])
             for m in np.flatnonzero(subset):
-                report = flat[m][report]
-            reports.append(report)
-        return jnp.stack(reports)
+                observation = flat[m][observation]
+            observations.append(observation)
+        return jnp.stack(observations)
 
 
 def _subsets(m: int) -> Bool[np.ndarray, "2**M M"]:

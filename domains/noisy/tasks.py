@@ -352,14 +352,14 @@ def demonstrate_noisy(
     steps: int = 3,
     starts: Starts = "all",
     scores: Scores | None = None,
-    view: Visibility | None = None,
+    visibility: Visibility | None = None,
     concentration: float = CONCENTRATION,
     reliabilities: np.ndarray | None = None,
 ) -> NoisyDemonstration:
     """Simulate the task's optimal expert and observe it through ``noise`` (by default the task's own).
 
     Session ``i`` is ``trajectories`` rows of ``steps`` pairs (``seen.sessions(trajectories)``); section
-    7.4.3 has two of three. Every trajectory starts afresh. ``view`` hides steps as well. Scores are
+    7.4.3 has two of three. Every trajectory starts afresh. ``visibility`` hides steps as well. Scores are
 
     - ``"calibrated"``, the perception's probability that it made no error. At every step each swap of the
       noise has a clarity ``u ~ Beta`` of mean one minus its noise and ``alpha + beta = concentration``, and
@@ -375,7 +375,7 @@ def demonstrate_noisy(
     - None: no scores.
 
     Raises ``ValueError`` for other words, sizes below one, a concentration or reliabilities that are none,
-    and noise or a view for another number of states or actions.
+    and noise or visibility for another number of states or actions.
     """
     if min(sessions, trajectories, steps) < 1:
         raise ValueError(
@@ -387,10 +387,10 @@ def demonstrate_noisy(
         raise ValueError(f"the concentration of the clarity must be positive, got {concentration}")
     noise = task.noise if noise is None else noise
     mdp, model = task.starting(starts), _reading(noise)
-    visibility = noise.visibility
-    if view is not None:
-        visibility = view.visibility if visibility is None else visibility * view.visibility
-    sensor = fitting_sensor(Sensor(visibility, model), mdp)
+    hidden = noise.visibility
+    if visibility is not None:
+        hidden = visibility.visibility if hidden is None else hidden * visibility.visibility
+    sensor = fitting_sensor(Sensor(hidden, model), mdp)
     if scores == "product":
         if reliabilities is None:
             reliabilities = (
@@ -401,12 +401,14 @@ def demonstrate_noisy(
         p = np.asarray(reliabilities, float)
         if p.shape != (len(task.predicates),) or not ((p >= 0) & (p <= 1)).all():
             raise ValueError(f"reliabilities are {len(task.predicates)} probabilities, got {reliabilities}")
-    walk, look, judge = jax.random.split(key, 3)
+    walk, perceive, judge = jax.random.split(key, 3)
     rows = sessions * trajectories
     with np.errstate(divide="ignore"):
         log_policy = jnp.asarray(np.log(task.expert_policy))
     states, actions = _walks(jax.random.split(walk, rows), mdp, log_policy, steps)
-    seen = Demonstration.from_codes(np.asarray(_looks(jax.random.split(look, rows), sensor, states, actions)))
+    seen = Demonstration.from_codes(
+        np.asarray(_looks(jax.random.split(perceive, rows), sensor, states, actions))
+    )
     truth = Demonstration.from_pairs(np.asarray(states), np.asarray(actions))
     if scores is not None:
         g = truth.state * mdp.n_actions + truth.action
@@ -431,11 +433,11 @@ def _clarity(
     key: Array,
     noise: AnySensor,
     truth: Int[np.ndarray, "n L"],
-    report: Int[np.ndarray, "n L"],
+    observation: Int[np.ndarray, "n L"],
     concentration: float,
 ) -> Float[np.ndarray, "n L"]:
     """Scores given what happened: the clarity's distribution once it is known whether a swap happened."""
-    g, o = truth.reshape(-1), report.reshape(-1)
+    g, o = truth.reshape(-1), observation.reshape(-1)
     if isinstance(noise, SwapNoise):
         wrong = np.asarray(noise.confused(jnp.asarray(g), jnp.asarray(o)))
         acts = np.asarray(noise.acts).reshape(len(noise.chances), -1).T
@@ -461,7 +463,7 @@ def _product(
     predicates: Bool[np.ndarray, "J S A"],
     reliabilities: Float[np.ndarray, " J"],
     truth: Int[np.ndarray, "n L"],
-    report: Int[np.ndarray, "n L"],
+    observation: Int[np.ndarray, "n L"],
 ) -> Float[np.ndarray, "n L"]:
     psi, p = predicates.reshape(len(predicates), -1), reliabilities[:, None, None]
-    return np.where(psi[:, truth] == psi[:, report], p, 1 - p).prod(axis=0)
+    return np.where(psi[:, truth] == psi[:, observation], p, 1 - p).prod(axis=0)

@@ -106,13 +106,13 @@ def main() -> None:
         (posterior_change, rare_setting(), (0.005, replications, 60)),
         (posterior_change, sorting_setting(), (0.005, 30, 60)),
     ]
-    for reliability, length, size, reports in (
+    for reliability, length, size, observations in (
         (0.7, 3, 3000, 10**7),
         *((p, _WHOLE, 2000, 10**9) for p in (0.5, 0.6, 0.7, 0.9)),
     ):
         setting = shift_setting(reliability, length)
         for shift in (-1.0, 1.0):
-            arguments = (learned, size, 4, reports, _DELTA, shift)
+            arguments = (learned, size, 4, observations, _DELTA, shift)
             studies.append((learned_perception_coverage, setting, arguments))
     rows: list[Coverage] = []
     ignorance = {}

@@ -311,7 +311,7 @@ def belief_plot(belief: Belief, theme: Theme, title: str = "What happened, and w
         panel.plot(steps, belief.mean[:, j], color=theme.series[0], linewidth=1.8)
         panel.plot(
             steps,
-            belief.reported[:, j],
+            belief.observed[:, j],
             linestyle="",
             marker="x",
             markersize=4,
@@ -345,9 +345,9 @@ def belief_plot(belief: Belief, theme: Theme, title: str = "What happened, and w
     ]
     head(figure, theme, handles, title=title, columns=4)
     inside = np.mean((belief.low <= belief.truth) & (belief.truth <= belief.high))
-    reported, believed = (np.sum((x - belief.truth) ** 2, 0) for x in (belief.reported, belief.mean))
-    wrong = reported > 0
-    errors = np.sqrt(believed[wrong] / reported[wrong]).mean() if wrong.any() else np.nan
+    observed, believed = (np.sum((x - belief.truth) ** 2, 0) for x in (belief.observed, belief.mean))
+    wrong = observed > 0
+    errors = np.sqrt(believed[wrong] / observed[wrong]).mean() if wrong.any() else np.nan
     left = (
         f"; its mean errs {errors:.0%} as much as the observations (root mean square)" if wrong.any() else ""
     )

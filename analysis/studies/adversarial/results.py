@@ -108,13 +108,13 @@ class Belief(NamedTuple):
     Fields
     ------
     names : str a component, with its unit
-    reported, truth : float ``[L, m]``
+    observed, truth : float ``[L, m]``
     mean, low, high : float ``[L, m]``, of the posterior; the ends of its middle ``coverage``
     coverage : float
     """
 
     names: tuple[str, ...]
-    reported: Float[np.ndarray, "L m"]
+    observed: Float[np.ndarray, "L m"]
     truth: Float[np.ndarray, "L m"]
     mean: Float[np.ndarray, "L m"]
     low: Float[np.ndarray, "L m"]
@@ -226,22 +226,22 @@ def reward_scatter(
 
 def belief_from_draws(
     names: Sequence[str],
-    reported: Float[np.ndarray, "L m"],
+    observed: Float[np.ndarray, "L m"],
     truth: Float[np.ndarray, "L m"],
     draws: Float[np.ndarray, "M L m"],
     coverage: float = 0.9,
 ) -> Belief:
     """Summarise ``M`` posterior draws of one trajectory's components. ``ValueError`` for unlike shapes."""
     shape = (len(truth), len(names))
-    if not np.shape(reported) == np.shape(truth) == np.shape(draws)[1:] == shape:
+    if not np.shape(observed) == np.shape(truth) == np.shape(draws)[1:] == shape:
         raise ValueError(
             f"{len(names)} components need arrays [L, {len(names)}] and draws [M, L, {len(names)}], got "
-            f"{np.shape(reported)}, {np.shape(truth)} and {np.shape(draws)}"
+            f"{np.shape(observed)}, {np.shape(truth)} and {np.shape(draws)}"
         )
     tail = (1 - coverage) / 2
     low, high = np.quantile(draws, [tail, 1 - tail], axis=0)
     return Belief(
-        tuple(names), np.asarray(reported), np.asarray(truth), np.mean(draws, 0), low, high, coverage
+        tuple(names), np.asarray(observed), np.asarray(truth), np.mean(draws, 0), low, high, coverage
     )
 
 

@@ -153,8 +153,8 @@ def run(name: str, method: str, seed: int, plan: Plan) -> Outcome:
     gathered = _gathered(method, plan)
     for session in range(plan.sessions // gathered):
         truth = _session(of.demonstrations, session, seed, gathered * plan.trajectories)
-        reported = distort(jax.random.fold_in(k_noise, session), of.sensor, truth)
-        given: Any = truth if method == CLEAN else reported
+        observed = distort(jax.random.fold_in(k_noise, session), of.sensor, truth)
+        given: Any = truth if method == CLEAN else observed
         report: Any
         state, report = online.update(state, given)
         policy = state.generator.policy
@@ -176,7 +176,7 @@ def run(name: str, method: str, seed: int, plan: Plan) -> Outcome:
         _error(of, state.network, policy, k_judge),
         np.array(sensors) if sensors else np.zeros((0, 0)),
         simulate(of.level, policy, k_judge, 1, 200, deterministic=True).observations[0],
-        _belief(of, policy, truth, reported) if method == ROBUST else None,
+        _belief(of, policy, truth, observed) if method == ROBUST else None,
         of.cells(policy) if of.cells else np.zeros((0, 0)),
     )
 
@@ -224,17 +224,17 @@ def _error(of: Case, network: Any, policy: Any, key: Array) -> EmpiricalILE:
     )
 
 
-def _belief(of: Case, policy: Any, truth: Recording, reported: Recording) -> Belief:
+def _belief(of: Case, policy: Any, truth: Recording, observed: Recording) -> Belief:
     """Complete the beginning of the last demonstration under the last policy."""
     names, columns = of.components
-    steps = min(_SHOWN_STEPS, int(reported.lengths[0]))
+    steps = min(_SHOWN_STEPS, int(observed.lengths[0]))
 
     def first(recording: Recording) -> Recording:
         observations, actions, live = (x[:1, :steps] for x in recording[:3])
         return Recording(observations, actions, live, jnp.zeros(1, bool))
 
     hidden = Smoothed(of.truth(draws=64), of.sensor)
-    begun = hidden.begin(first(reported), of.sensor, jax.random.key(0))
+    begun = hidden.begin(first(observed), of.sensor, jax.random.key(0))
     _, drawn = hidden.refresh(begun, of.sensor, policy, jax.random.key(0))
     d = truth.observations.shape[-1]
 
@@ -246,7 +246,7 @@ def _belief(of: Case, policy: Any, truth: Recording, reported: Recording) -> Bel
 
     return belief_from_draws(
         names,
-        picked(first(reported).observations[0], first(reported).actions[0]),
+        picked(first(observed).observations[0], first(observed).actions[0]),
         picked(first(truth).observations[0], first(truth).actions[0]),
         np.moveaxis(picked(drawn.steps.observations, drawn.steps.actions), 1, 0),
     )

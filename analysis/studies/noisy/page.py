@@ -208,7 +208,7 @@ def doubt_table(study: NoisyStudy) -> Table:
                     method if j == 0 else "",
                     name,
                     _with_interval(doubt.erratic[:, j], digits=2),
-                    _with_interval(doubt.decided[:, j], digits=2),
+                    _with_interval(doubt.optimal[:, j], digits=2),
                     f"{study.true_agreement[j]:.2f}",
                     f"{doubt.identified[:, j].sum()} of {len(doubt.identified)}",
                 )

@@ -126,7 +126,7 @@ def draw_streams(
     starts: Starts = "all",
     steps: int = STEPS,
     noise: AnySensor | None = None,
-    view: Visibility | None = None,
+    visibility: Visibility | None = None,
 ) -> Streams:
     """Independent streams with calibrated scores, all trajectories drawn in one go.
 
@@ -141,7 +141,7 @@ def draw_streams(
         steps=steps,
         starts=starts,
         scores="calibrated",
-        view=view,
+        visibility=visibility,
     )
     shape = (replications, sessions, TRAJECTORIES, steps)
     seen, truth = (
@@ -184,13 +184,13 @@ class SensorDoubt(NamedTuple):
 
     Fields
     ------
-    erratic, decided : float ``[replications, J]``
+    erratic, optimal : float ``[replications, J]``
         Agreement of the task's predicates, by what is assumed of the expert.
     identified : bool ``[replications, J]``
     """
 
     erratic: Float[np.ndarray, "replications J"]
-    decided: Float[np.ndarray, "replications J"]
+    optimal: Float[np.ndarray, "replications J"]
     identified: Bool[np.ndarray, "replications J"]
 
     @property
@@ -321,11 +321,11 @@ class _Judge(NamedTuple):
         robust = robust_irl(streams.mdp, self.task.noise, slack=0.0, ridge=DEFAULT_RIDGE)
         weights = []
         for run in range(min(replications, FEW)):
-            reports, own = streams.whole(run), jax.random.fold_in(key, run)
+            observations, own = streams.whole(run), jax.random.fold_in(key, run)
             if name == ROBUST:
-                weights.append(robust.fit(own, reports).weights)
+                weights.append(robust.fit(own, observations).weights)
             else:
-                weights.append(mlirl(own, *taken_at_face_value(streams.mdp, reports)).weights)
+                weights.append(mlirl(own, *taken_at_face_value(streams.mdp, observations)).weights)
         return self.result(name, np.array([sessions]), np.array(weights)[:, None])
 
 
@@ -373,18 +373,18 @@ def _kept(perceives: bool, state: Any, report: Any) -> tuple:
 
 def _one_by_one(key: Array, learner: Learner, streams: Streams, run: int) -> tuple:
     sessions = streams.seen.kind.shape[1]
-    reports: Any = run_sessions(learner, (streams.session(run, t) for t in range(sessions)), key=key).infos
-    return [report.weights for report in reports], [report.agreement for report in reports]
+    infos: Any = run_sessions(learner, (streams.session(run, t) for t in range(sessions)), key=key).infos
+    return [info.weights for info in infos], [info.agreement for info in infos]
 
 
-def taken_at_face_value(mdp: TabularMDP, reports: Demonstration) -> tuple[TabularMDP, Demonstration]:
+def taken_at_face_value(mdp: TabularMDP, observations: Demonstration) -> tuple[TabularMDP, Demonstration]:
     """Take observations for truths, for a learner without a noise model: each pair by itself, anywhere.
 
     Wrong observations follow one another as no process could, so transitions carry no information;
     unavailable pairs are dropped.
     """
-    seen = np.asarray(reports.kind) == SEEN
-    states, actions = np.asarray(reports.state)[seen], np.asarray(reports.action)[seen]
+    seen = np.asarray(observations.kind) == SEEN
+    states, actions = np.asarray(observations.state)[seen], np.asarray(observations.action)[seen]
     offered = np.asarray(mdp.available)[states, actions]
     anywhere = mdp.with_initial(jnp.full(mdp.n_states, 1 / mdp.n_states))
     return anywhere, Demonstration.from_pairs(states[offered, None], actions[offered, None])
@@ -396,11 +396,11 @@ def _doubted(task: NoisyTask, streams: Streams, result: MethodResult, scores: st
         identify(streams.whole(run), result.weights[run, -1]) for run in range(min(len(result.weights), FEW))
     ]
     n_predicates = len(task.predicates)
-    erratic, decided, identified = (
+    erratic, optimal, identified = (
         np.array([getattr(x, name)[:n_predicates] for x in found])
         for name in ("erratic", "decided", "identified")
     )
-    return SensorDoubt(erratic, decided, identified)
+    return SensorDoubt(erratic, optimal, identified)
 
 
 # -- the study ----------------------------------------------------------------------------------------
@@ -529,7 +529,7 @@ def _hidden(
             starts=starts,
             steps=HIDDEN_STEPS,
             noise=noise,
-            view=view,
+            visibility=view,
         )
         learner = entry.learner(streams.mdp, judge.task)
         results[method] = judge.online(method, learn, learner, streams, entry)

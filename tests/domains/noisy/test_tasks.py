@@ -157,10 +157,10 @@ def test_a_prediction_whose_opposite_is_no_state_is_reported_rightly() -> None:
 
 def test_noise_composes_with_a_view_and_passes_through_compilation() -> None:
     task = sorting_task()
-    view = Visibility(np.arange(22) % 3 != 0)
-    data = demonstrate_noisy(jax.random.key(0), task, sessions=10, view=view)
-    plain = log_evidence(view * task.noise, data.mdp, data.seen)
-    np.testing.assert_array_equal(log_evidence(task.noise * view, data.mdp, data.seen), plain)
+    visibility = Visibility(np.arange(22) % 3 != 0)
+    data = demonstrate_noisy(jax.random.key(0), task, sessions=10, visibility=visibility)
+    plain = log_evidence(visibility * task.noise, data.mdp, data.seen)
+    np.testing.assert_array_equal(log_evidence(task.noise * visibility, data.mdp, data.seen), plain)
     compiled = jax.jit(lambda noise: noise.noise.log_probabilities)(task.noise)
     np.testing.assert_allclose(np.exp(compiled), table_of(task.noise), atol=1e-12)
 
@@ -378,19 +378,19 @@ def test_product_scores_are_equation_6_5(of: str) -> None:
 
 def test_sessions_scores_and_views_of_a_demonstration() -> None:
     task = patrol_task()
-    view = instance(2).visibility(30)
+    visibility = instance(2).visibility(30)
     data = demonstrate_noisy(
         jax.random.key(9),
         task,
         sessions=4,
         trajectories=3,
         steps=5,
-        view=view,
+        visibility=visibility,
         scores="calibrated",
         starts="natural",
     )
     assert [part.kind.shape for part in data.seen.sessions(3)] == [(3, 5)] * 4
-    in_view = np.asarray(view.in_view)[data.truth.state] == 1
+    in_view = np.asarray(visibility.in_view)[data.truth.state] == 1
     np.testing.assert_array_equal(data.seen.kind, np.where(in_view, SEEN, HIDDEN))
     np.testing.assert_array_equal(np.isnan(data.seen.score), ~in_view)
     unscored = demonstrate_noisy(

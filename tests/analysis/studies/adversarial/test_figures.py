@@ -210,7 +210,7 @@ def test_beliefs_show_truth_reports_and_posterior(hopper, theme):
     assert [p.get_title(loc="left") for p in panels] == list(hopper.belief.names)
     for j, panel in enumerate(panels):
         drawn = [line.get_ydata() for line in panel.lines]
-        for array in (hopper.belief.truth, hopper.belief.reported, hopper.belief.mean):
+        for array in (hopper.belief.truth, hopper.belief.observed, hopper.belief.mean):
             assert any(np.array_equal(line, array[:, j]) for line in drawn)
     inside = np.mean((hopper.belief.low <= hopper.belief.truth) & (hopper.belief.truth <= hopper.belief.high))
     assert f"{inside:.0%} of the truth" in figure.get_supxlabel()
