@@ -9,7 +9,7 @@ EXTRA_OF = {"equinox": "adversarial", "optax": "adversarial", "mujoco": "adversa
 
 
 def required(package: str) -> ModuleType:
-    """The package, imported.
+    """Import the package and return it.
 
     Raises ``ModuleNotFoundError`` that says which extra of i2rl to install.
     """

@@ -1,7 +1,8 @@
 """List the packages, and state the project's addresses.
 
-The repository's root is ``i2rl``, and its rooms lie under it. ``I2RL_URL`` names the repository's address when a
-release is built: relative links and pictures of the README then become absolute, as a package index needs them.
+The repository's root is ``i2rl``, and its rooms lie under it. ``I2RL_URL`` names the repository's address
+when a release is built: relative links and pictures of the README then become absolute, as a package index
+needs them.
 """
 
 import os

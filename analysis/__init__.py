@@ -1,4 +1,4 @@
-"""What is concluded: metrics, bounds, diagnostics, figures and studies.
+"""Conclusions: metrics, bounds, diagnostics, figures and studies.
 
 Names are loaded when they are first used.
 """

@@ -1,4 +1,4 @@
-"""What is learned from: patrols and their breach, onion sorting, object worlds, a mouse in a labyrinth.
+"""Tasks to learn from: patrols and their breach, onion sorting, object worlds, a mouse in a labyrinth.
 
 Importing it registers them with Gymnasium; see :mod:`i2rl.domains.environments`. Names are loaded when they
 are first used; continuous tasks need the extra ``adversarial``.

@@ -1,4 +1,4 @@
-"""Every domain as a Gymnasium environment: importing this module registers them all.
+"""Gymnasium environments of every domain; importing this module registers them.
 
 ======================================  ================================================================
 ``i2rl/Patrol1-v0`` to ``Patrol3-v0``   one patroller on its floor
@@ -7,7 +7,7 @@
 ``i2rl/SortingWithoutClaiming-v0``      onion sorting, 23 states; likewise
 ``i2rl/PickInspectPlace-v0``            onion sorting, 22 states
 ``i2rl/ObjectWorld-v0``                 a walled grid; ``layout`` seeds its walls
-``i2rl/Breach2-v0``, ``Breach3-v0``     the learner's way past the patrollers; ``observability`` its view
+``i2rl/Breach2-v0``, ``Breach3-v0``     the learner's path past the patrollers; ``observability`` its view
 ======================================  ================================================================
 
 Those with a :class:`TabularMDP` are :class:`TabularEnv` and take ``weights``, the reward ``weights .
@@ -53,7 +53,7 @@ def patrol_environment(number: int = 2, weights: Sequence[float] | None = None, 
 
 
 def labyrinth_environment(weights: Sequence[float] | None = None, **options: Any) -> TabularEnv:
-    """The mouse; by default reaching the water port earns one, and nothing else anything."""
+    """Make the mouse's environment; by default it earns one at the water port and zero elsewhere."""
     maze = mouse_labyrinth()
     thirst = np.array([name == f"reaches {WATER_PORT}" for name in maze.mdp.feature_names], float)
 
@@ -113,7 +113,7 @@ def object_world_environment(
     weights: Sequence[float] | None = None,
     **options: Any,
 ) -> TabularEnv:
-    """An Object World whose walls are drawn from the seed ``layout``."""
+    """Make the environment of an Object World; the seed ``layout`` determines its walls."""
     world = random_object_world(jax.random.key(layout), size, walls, slip=slip)
 
     def scene() -> Scene:
@@ -125,7 +125,7 @@ def object_world_environment(
 
 
 def breach_environment(number: int = 2, **options: Any) -> BreachEnv:
-    """The breach of an instance; other options as :class:`BreachEnv`."""
+    """Make the environment of an instance's breach; other options as :class:`BreachEnv`."""
     from .patrol.environment import BreachEnv
 
     return BreachEnv(instance(number), **options)
@@ -141,7 +141,7 @@ ENVIRONMENTS: dict[str, tuple[str, int, dict[str, Any]]] = {
     "i2rl/SortingWithoutClaiming-v0": ("sorting_environment", 50, {"process": "without claiming"}),
     "i2rl/PickInspectPlace-v0": ("sorting_environment", 50, {"process": "pick-inspect-place"}),
     "i2rl/ObjectWorld-v0": ("object_world_environment", 50, {}),
-    # Two rounds of the patrol to leave in, and sixty steps for the way.
+    # Two rounds of the patrol to leave in, and sixty steps for the path.
     "i2rl/Breach2-v0": ("breach_environment", 172, {"number": 2}),
     "i2rl/Breach3-v0": ("breach_environment", 188, {"number": 3}),
 }

@@ -34,7 +34,7 @@ _MANY_REGIONS = 20_000
 
 @pytest.fixture(autouse=True, scope="module")
 def _compiled_programs_are_let_go():
-    """Every compiled program takes some regions, and a worker runs many modules."""
+    """Release compiled programs: each takes some regions, and a worker runs many modules."""
     yield
     regions = Path("/proc/self/maps")
     if regions.exists() and len(regions.read_text().splitlines()) > _MANY_REGIONS:
@@ -49,7 +49,7 @@ def small_pictures(monkeypatch):
 
 @pytest.fixture(scope="session")
 def page_faults() -> Callable[[str], list[str]]:
-    """What a reader of a page would stumble over; nothing, if all is well."""
+    """List the faults of a page that would disturb a reader; empty for a sound page."""
     return _page_faults
 
 
@@ -188,7 +188,7 @@ def dense_transitions() -> Callable[[TabularMDP], np.ndarray]:
 
 @pytest.fixture(scope="session")
 def enumerate_completions() -> Callable[..., Enumeration]:
-    """All completions of ``log_evidence [L, S, A]`` with their posterior, by summation over everything."""
+    """Enumerate the completions of one trajectory ``log_evidence [L, S, A]`` with their posterior."""
     return _enumerate
 
 

@@ -64,6 +64,103 @@ def test_tests_lie_in_the_tree_of_what_they_test():
     assert [str(folder) for folder in folders if not (ROOT / folder).is_dir()] == []
 
 
+OPENINGS = {"what", "whether", "how", "who", "of", "as", "nothing", "itself", "where", "under", "does"}
+OTHER_WORDS = {
+    *("clusters", "decided", "demos", "eta", "imperfection", "jumble", "l1", "look", "memory", "n_clusters"),
+    *("n_ways", "price", "rate", "reading", "readings", "report", "reports", "rounds", "runs", "samplings"),
+    *("seeds", "shown", "sweeps", "told", "view", "ways"),
+}
+# A word of the field that the glossary replaces in another sense.
+IN_ITS_OWN_SENSE = {
+    ("rounds", "domains/patrol/breach.py:BreachSettings"): "rounds of a patrol's loop",
+    ("view", "analysis/drawing/style.py:Theme"): "colour of the cells in view",
+    ("view", "analysis/studies/labyrinth/study.py:ViewStudy"): "name of a part of the maze",
+    ("sweeps", "analysis/bounds/stopping.py:stopping_plot"): "sweeps over a parameter",
+    ("sweeps", "analysis/studies/methods/study.py:MethodsStudy"): "sweeps over a parameter",
+    ("sweeps", "inference/completion/gibbs.py:GibbsChain"): "sweeps of a Gibbs sampler",
+    ("sweeps", "inference/completion/gibbs.py:GaussianGibbs"): "sweeps of a Gibbs sampler",
+}
+
+# Public names older than the glossary; the list only shrinks.
+OLDER = {
+    ("view", "models/laws/noisy_behaviour.py:noisy_behaviour_model"),
+    ("report", "models/observation/confusions.py:confused"),
+    ("rate", "models/process/planning.py:solve_values"),
+    ("shown", "inference/adversarial/noise_injection.py:steps"),
+    ("shown", "inference/adversarial/noise_injection.py:NoisyTraining"),
+    ("view", "inference/adversarial/tabular/learners.py:robust_airl_with_learned_sensor"),
+    ("memory", "inference/adversarial/tabular/training.py:TabularTraining"),
+    ("reading", "inference/completion/kalman.py:AffineGaussian"),
+    ("readings", "inference/completion/kalman.py:filter_gaussian"),
+    ("readings", "inference/completion/kalman.py:smooth_gaussian"),
+    ("report", "inference/journal/journal.py:SessionRecord"),
+    ("report", "inference/journal/journal.py:commit"),
+    ("decided", "inference/learners/identification.py:SensorIdentification"),
+    ("view", "inference/learners/identification.py:sensor_identifier"),
+    ("reports", "inference/learners/noisy.py:RIMEOState"),
+    ("view", "inference/learners/noisy.py:rimeo"),
+    ("view", "inference/learners/noisy.py:rifom"),
+    ("view", "inference/posteriors/noisy.py:NoisyProblem"),
+    ("view", "inference/posteriors/noisy.py:noisy_problem"),
+    ("view", "inference/posteriors/noisy.py:sample_noisy_posterior"),
+    ("sweeps", "inference/programs/printed/minmax.py:ascend_printed"),
+    ("report", "inference/sensors/confusions.py:confused"),
+    ("reports", "inference/sensors/observations.py:report_log_evidence"),
+    ("reports", "inference/sensors/observations.py:score_statistic"),
+    ("reports", "inference/sensors/observations.py:report_statistic"),
+    ("reports", "inference/sensors/reliabilities.py:PreparedSession"),
+}
+
+
+def docstrings(path: Path) -> list[str]:
+    """Docstrings of a file, of its types and of its functions."""
+    kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+    nodes = [n for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, kinds)]
+    return [text for text in map(ast.get_docstring, nodes) if text]
+
+
+def public_names(path: Path) -> list[tuple[str, str]]:
+    """Parameters and fields of a file's public functions and types, with the function or type."""
+
+    def below(node: ast.AST) -> list[tuple[str, str]]:
+        found = []
+        for child in ast.iter_child_nodes(node):
+            if isinstance(child, ast.FunctionDef | ast.AsyncFunctionDef) and not child.name.startswith("_"):
+                a = child.args
+                found += [(x.arg, child.name) for x in (*a.posonlyargs, *a.args, *a.kwonlyargs)]
+            if isinstance(child, ast.ClassDef) and not child.name.startswith("_"):
+                fields = [x.target for x in child.body if isinstance(x, ast.AnnAssign)]
+                found += [(x.id, child.name) for x in fields if isinstance(x, ast.Name)]
+                found += below(child)
+        return found
+
+    return below(ast.parse(path.read_text()))
+
+
+@pytest.mark.parametrize("folder", [*FOLDERS, "tests"])
+def test_docstrings_open_with_a_verb_or_a_noun(folder):
+    opened = [
+        (str(path.relative_to(ROOT)), text.splitlines()[0])
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        for text in docstrings(path)
+        if text.split()[0].strip(",.:;").lower() in OPENINGS
+    ]
+    assert opened == []
+
+
+@pytest.mark.parametrize("folder", FOLDERS)
+def test_public_names_are_the_glossarys(folder):
+    others = [
+        (name, where)
+        for path in sorted((ROOT / folder).rglob("*.py"))
+        if "benchmarks" not in path.parts
+        for name, owner in public_names(path)
+        for where in [f"{path.relative_to(ROOT)}:{owner}"]
+        if name in OTHER_WORDS and (name, where) not in {*OLDER, *IN_ITS_OWN_SENSE}
+    ]
+    assert others == []
+
+
 @pytest.mark.parametrize("folder", FOLDERS)
 def test_a_face_lists_its_names_completely_and_loads_each(folder):
     face = importlib.import_module(f"i2rl.{folder}")

@@ -1,4 +1,4 @@
-"""What is learned does not depend on the units of the features: for every learner, program and posterior.
+"""Independence from the units of the features: for every learner, program and posterior.
 
 The benchmark ``units`` runs every method in more units than there is time for here.
 """
@@ -122,10 +122,23 @@ def test_sessions_learn_the_same_behaviour_in_all_units(name):
 
 # Their programs are compiled once for all units, or cost little.
 CHEAP = [
-    "solve_dual", "fit_counts", "exponentiated_gradient", "DualProgram", "CountProgram", "PrimalProgram",
-    "MinMaxProgram", "fit_weights", "darko_i2rl", "jin_i2rl_with_features", "mme_mtirl", "mlirl", "em_mlirl",
-    "dpm_birl", "birl", "batch_mme_mtirl",
-]  # fmt: skip
+    "solve_dual",
+    "fit_counts",
+    "exponentiated_gradient",
+    "DualProgram",
+    "CountProgram",
+    "PrimalProgram",
+    "MinMaxProgram",
+    "fit_weights",
+    "darko_i2rl",
+    "jin_i2rl_with_features",
+    "mme_mtirl",
+    "mlirl",
+    "em_mlirl",
+    "dpm_birl",
+    "birl",
+    "batch_mme_mtirl",
+]
 
 
 @pytest.mark.parametrize("name", CHEAP)

@@ -1,4 +1,4 @@
-"""Shared by the benchmarks: medians of several runs, a JSON file, and a table."""
+"""Shared parts of the benchmarks: medians of several runs, a JSON file, and a table."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ def seconds(action: Callable[[], Any]) -> float:
     return time.perf_counter() - began
 
 
-def median_seconds(action: Callable[[], Any], runs: int = 5) -> float:
+def median_seconds(action: Callable[[], Any], replications: int = 5) -> float:
     """Median over several calls, after one that compiles."""
     action()
-    return float(np.median([seconds(action) for _ in range(runs)]))
+    return float(np.median([seconds(action) for _ in range(replications)]))
 
 
 def machine() -> dict[str, Any]:
-    """What the numbers were measured on."""
+    """Describe the machine of the measurements."""
     load = os.getloadavg()[0] if hasattr(os, "getloadavg") else float("nan")
     return {"cores": os.cpu_count(), "python": platform.python_version(), "load": round(load, 2)}
 

@@ -1,4 +1,4 @@
-"""What a bound rests on: assumptions that are checked, not assumed.
+"""Assumptions of a bound, checked where possible.
 
 The theorems ask for weights and features in [0, 1], a soft expert, whole independent trajectories, and an
 M-step that met its threshold. A :class:`Bound` carries these premises with it; :func:`check` decides those
@@ -36,7 +36,7 @@ class BoundNotGuaranteed(ValueError):
 
 
 class Bound(NamedTuple):
-    """What a theorem promises.
+    """Promise of a theorem.
 
     Fields
     ------
@@ -70,11 +70,11 @@ class Bound(NamedTuple):
 
     @property
     def undecided(self) -> tuple[Assumption, ...]:
-        """Assumptions that nobody has decided."""
+        """Assumptions still open."""
         return tuple(a for a in self.assumptions if a.holds is None)
 
     def assuming(self, **decided: bool) -> Bound:
-        """The bound with assumptions decided by name: what its user knows and no run can show.
+        """Return the bound with assumptions stated by name, which the user knows and no simulation can show.
 
         Raises ``ValueError`` for a name that is not one of its assumptions, and for one that was found not
         to hold.
@@ -98,7 +98,7 @@ class Bound(NamedTuple):
         )
 
     def guarantee(self) -> str:
-        """The bound in a sentence, with whatever it still takes on trust.
+        """Write the bound in a sentence, with the assumptions that it still takes on trust.
 
         Raises :class:`BoundNotGuaranteed` if an assumption does not hold or the confidence is zero.
         """
@@ -124,18 +124,19 @@ DIMINISHING = Assumption(
 )
 SOLVED = Assumption("solved", "the maximum-entropy program was solved within its slack")
 COMPLETION = Assumption(
-    "completion", "completed features are within epsilon_s of the fully observed ones as often as sampled "
+    "completion",
+    "completed features are within epsilon_s of the fully observed ones as often as sampled "
     "means are (Hoeffding, n_s draws)",
-)  # fmt: skip
+)
 OBSERVATION = Assumption(
-    "observation", "the estimated observation model is within epsilon_o of the true one as often as a mean "
-    "of n_o values is",
-)  # fmt: skip
+    "observation",
+    "the estimated observation model is within epsilon_o of the true one as often as a mean of n_o values is",
+)
 PREDICATES_SEEN = Assumption("predicates_seen", "every predicate is observed in the first session")
 INDEPENDENT_PREDICATES = Assumption(
-    "independent_predicates", "every predicate is reported rightly or wrongly by itself, with one "
-    "probability at every pair and step",
-)  # fmt: skip
+    "independent_predicates",
+    "every predicate is reported rightly or wrongly by itself, with one probability at every pair and step",
+)
 KNOWN_TRUTHS = Assumption(
     "known_truths", "reliabilities were counted on n_o independent reports whose truth was known"
 )
@@ -161,13 +162,13 @@ def check(
     learner: Learner | None = None,
     state: Any = None,
 ) -> Bound:
-    """Decide the assumptions that can be decided from what is given; the others stay as they are.
+    """Check the assumptions that the arguments settle; the others stay open.
 
     Parameters
     ----------
     bound : Bound
     mdp : TabularMDP
-        Decides whether features lie in [0, 1]. Taken from ``learner`` if that is given.
+        Settles whether features lie in [0, 1]. Taken from ``learner`` if that is given.
     weights : float ``[K]``
         The expert's: whether they lie in [0, 1].
     expert : float ``[S, A]``
@@ -175,8 +176,8 @@ def check(
     length : int
         Steps of a trajectory: whether what lies beyond them is negligible against ``epsilon``.
     learner, state
-        The run: whether the program is the theorem's, and was solved within its slack in the state's
-        session (a bound on regret needs it of every session).
+        Settle whether the program is the theorem's, and was solved within its slack in the state's session (a
+        bound on regret needs it in every session).
 
     Raises
     ------
@@ -253,7 +254,7 @@ def _theorems_program(learner: Learner, bound: Bound) -> tuple[bool, str]:
 
 
 def _solved(learner: Learner, state: Any, bound: Bound) -> tuple[bool, str]:
-    """Whether the weights are feasible, and optimal up to a thousandth of the bound."""
+    """Test whether the weights are feasible, and optimal up to a thousandth of the bound."""
     if learner.configuration.get("statistic") != "features":
         return False, "another program was solved"
     mdp, weights, scale = learner.mdp, state.weights, feature_scale(learner.mdp)

@@ -1,9 +1,9 @@
-"""How far a mean of independent values in [0, 1] can be from its expectation.
+"""Concentration of a mean of independent values in [0, 1] about its expectation.
 
-Hoeffding's inequality, which the dissertation's theorems use, knows only the range. Where values vary
-little, as discounted feature averages do, the observed variance gives much narrower intervals: Maurer and
+Hoeffding's inequality, which the dissertation's theorems use, depends only on the range. For values that vary
+little, such as discounted feature averages, the observed variance gives much narrower intervals: Maurer and
 Pontil (2009), and the predictable plug-in intervals of Waudby-Smith and Ramdas (2023), whose confidence
-sequence holds at all sample sizes at once, so that an online learner may look at it after every session.
+sequence holds at all sample sizes at once, so that an online learner may check it after every session.
 
 Values are ``[..., n, K]``: ``n`` independent observations of ``K`` quantities. ``delta`` is the failure
 probability of *one* quantity's two-sided interval; for ``K`` at once give ``delta / K`` (union bound).
@@ -31,7 +31,7 @@ class Interval(NamedTuple):
     half_width: Float[np.ndarray, "... K"]
 
     def covers(self, expectation: Float[np.ndarray, "... K"]) -> np.ndarray:
-        """Whether each interval holds the expectation, boolean ``[..., K]``."""
+        """Test whether each interval holds the expectation, boolean ``[..., K]``."""
         return np.abs(self.center - expectation) <= self.half_width
 
 
@@ -138,9 +138,9 @@ def bernstein_size(deviation: float, error: float, delta: float) -> int:
 
 
 def predictable_half_width(deviation: float, size: int, delta: float) -> float:
-    """What :func:`predictable_bernstein`'s half-width will be about, for values of known deviation.
+    """Predict the half-width of :func:`predictable_bernstein` for values of known deviation.
 
-    Includes the price of its first predictions for the least favourable expectation, 0 or 1.
+    Includes the cost of its first predictions for the least favourable expectation, 0 or 1.
     """
     variance, (t, count) = deviation**2, _blocks(size)
     # Expected squared error of the prediction before value t, which starts at 1/2 with a value's weight.
@@ -153,7 +153,7 @@ def predictable_half_width(deviation: float, size: int, delta: float) -> float:
 
 
 def _blocks(size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Times ``1..size`` and how many each stands for: late ones in blocks, so that any size is cheap."""
+    """Return times ``1..size`` and their multiplicities; late times share blocks to bound the cost."""
     first = min(size, 4096)
     t = np.arange(1.0, first + 1)
     if size == first:

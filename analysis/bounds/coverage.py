@@ -1,10 +1,10 @@
-"""Do the bounds hold, and how loose are they? Repeated simulated runs against each theorem's promise.
+"""Coverage and looseness of the bounds: replications against each theorem's promise.
 
 The expert obeys the model the theorems assume (the soft policy of weights in [0, 1]^K), trajectories are
-independent, and the program is the theorems': the one place where every assumption can be made true, so
-that a miss would be the theorem's. A run simulates ``n`` trajectories, fits, and asks whether the expert's
-expected log-likelihood is within the bound of the solution's. What lies beyond a trajectory's last step
-enters with its exact expectation under the expert, which keeps means and ranges exact.
+independent, and the program is the theorems': here every assumption holds, so a miss would refute the
+theorem. A replication simulates ``n`` trajectories, fits, and tests whether the expert's expected
+log-likelihood is within the bound of the solution's. The rest beyond a trajectory's last step enters with its
+exact expectation under the expert, so means and ranges are exact.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ class Setting(NamedTuple):
 
 
 class Coverage(NamedTuple):
-    """How a bound fared in repeated runs.
+    """Coverage of a bound in replications.
 
     Fields
     ------
@@ -65,11 +65,11 @@ class Coverage(NamedTuple):
     trajectories : int
         ``n``; in all sessions, for the regret.
     confidence, covered : float
-        The stated one, and the share of runs within the bound.
+        The stated one, and the share of replications within the bound.
     bound, quantile : float
-        The bound (median over runs where it depends on the data), and the quantile of what was seen at the
-        stated confidence: the smallest number that would have been right as often.
-    runs : int
+        The bound (median over replications where it depends on the data), and the quantile of what was seen
+        at the stated confidence: the smallest number that would have been right as often.
+    replications : int
     """
 
     setting: str
@@ -79,16 +79,16 @@ class Coverage(NamedTuple):
     covered: float
     bound: float
     quantile: float
-    runs: int
+    replications: int
 
     @property
     def looseness(self) -> float:
-        """How many times larger the bound is than the quantile seen."""
+        """Ratio of the bound to the quantile observed."""
         return self.bound / self.quantile
 
 
 class Expert(NamedTuple):
-    """What is known exactly of an expert who obeys the soft model."""
+    """Exact properties of an expert who obeys the soft model."""
 
     weights: Float[Array, " K"]
     log_policy: Float[Array, "S A"]
@@ -107,10 +107,10 @@ def expert_of(mdp: TabularMDP, weights: Float[Array, " K"]) -> Expert:
 # -- simulation ---------------------------------------------------------------------------------------
 
 
-@partial(jax.jit, static_argnames=("length", "runs", "size"))
+@partial(jax.jit, static_argnames=("length", "replications", "size"))
 def simulate_features(
-    key: Array, mdp: TabularMDP, expert: Expert, length: int, runs: int, size: int
-) -> Float[Array, "runs size K"]:
+    key: Array, mdp: TabularMDP, expert: Expert, length: int, replications: int, size: int
+) -> Float[Array, "replications size K"]:
     """Discounted features of independent, fully seen trajectories."""
     powers = mdp.discount ** jnp.arange(length + 1)
 
@@ -118,20 +118,20 @@ def simulate_features(
         states, actions = simulate(key, mdp, expert.log_policy, length + 1)
         return powers[:-1] @ mdp.features[states[:-1], actions[:-1]] + powers[-1] * expert.to_go[states[-1]]
 
-    return lax.map(jax.vmap(one), jax.random.split(key, (runs, size)))
+    return lax.map(jax.vmap(one), jax.random.split(key, (replications, size)))
 
 
-@partial(jax.jit, static_argnames=("length", "runs", "size"))
+@partial(jax.jit, static_argnames=("length", "replications", "size"))
 def simulate_codes(
-    key: Array, mdp: TabularMDP, expert: Expert, sensor: AnySensor, length: int, runs: int, size: int
-) -> Int[Array, "runs size L 3"]:
-    """What a sensor lets through of independent trajectories, as :attr:`Demonstration.codes`."""
+    key: Array, mdp: TabularMDP, expert: Expert, sensor: AnySensor, length: int, replications: int, size: int
+) -> Int[Array, "replications size L 3"]:
+    """Simulate the observation of independent trajectories, as :attr:`Demonstration.codes`."""
 
     def one(key: Array) -> Int[Array, "L 3"]:
         walk, look = jax.random.split(key)
         return observe(look, sensor, *simulate(walk, mdp, expert.log_policy, length))
 
-    return lax.map(jax.vmap(one), jax.random.split(key, (runs, size)))
+    return lax.map(jax.vmap(one), jax.random.split(key, (replications, size)))
 
 
 class Completed(NamedTuple):
@@ -140,16 +140,16 @@ class Completed(NamedTuple):
     ``exact`` is their expectation given what was seen, ``sampled`` their mean over some completions.
     """
 
-    exact: Float[Array, "runs size K"]
-    sampled: Float[Array, "runs size K"]
+    exact: Float[Array, "replications size K"]
+    sampled: Float[Array, "replications size K"]
 
 
 @partial(jax.jit, static_argnames=("draws",))
 def complete_features(
     key: Array, mdp: TabularMDP, expert: Expert, sensor: AnySensor, codes: Array, draws: int
 ) -> Completed:
-    """Complete each trajectory of ``codes [runs, size, L, 3]``, exactly and by ``draws`` backward samples."""
-    runs, size, length, _ = codes.shape
+    """Complete each trajectory of ``codes [replications, size, L, 3]``, exactly and by ``draws`` samples."""
+    replications, size, length, _ = codes.shape
     powers = mdp.discount ** jnp.arange(length + 1)
     beyond = powers[-1] * jax.vmap(mdp.expect_next, in_axes=1, out_axes=2)(expert.to_go)
 
@@ -173,12 +173,12 @@ def complete_features(
 
         return exact, jax.vmap(sample)(keys, factors, filter_all(mdp, factors, live), live)
 
-    n = runs * size
+    n = replications * size
     # Whole batches; what is repeated to fill the last one is cut off again.
     rows = jnp.arange(-(-n // _BATCH) * _BATCH).reshape(-1, _BATCH) % n
     given = (jax.random.split(key, n)[rows], codes.reshape(-1, length, 3)[rows])
     completed = lax.map(several, given)
-    return Completed(*(x.reshape(-1, x.shape[-1])[:n].reshape(runs, size, -1) for x in completed))
+    return Completed(*(x.reshape(-1, x.shape[-1])[:n].reshape(replications, size, -1) for x in completed))
 
 
 # -- fits ---------------------------------------------------------------------------------------------
@@ -186,8 +186,11 @@ def complete_features(
 
 @jax.jit
 def expected_gaps(
-    mdp: TabularMDP, expert: Expert, targets: Float[Array, "runs K"], slacks: Float[Array, "runs K"]
-) -> Float[Array, " runs"]:
+    mdp: TabularMDP,
+    expert: Expert,
+    targets: Float[Array, "replications K"],
+    slacks: Float[Array, "replications K"],
+) -> Float[Array, " replications"]:
     """``LL(theta_E) - LL(theta)`` of each program's solution, in expectation over the expert's trajectories.
 
     ``slacks`` are in units of the features as given.
@@ -207,12 +210,12 @@ def expected_gaps(
 def expected_gap(
     mdp: TabularMDP, expert: Expert, weights: Float[Array, " K"], values: Float[Array, " S"]
 ) -> Float[Array, ""]:
-    """The expert's expected log-likelihood less that of other weights, given their soft values."""
+    """Compute the expert's expected log-likelihood less that of other weights, given their soft values."""
     return (expert.weights - weights) @ expert.features - mdp.initial @ (expert.values - values)
 
 
 def ignorance_gap(mdp: TabularMDP, weights: Float[Array, " K"]) -> float:
-    """The gap of zero weights: a bound above it promises less than what knowing nothing achieves."""
+    """Compute the gap of zero weights: a bound above it promises less than ignorance achieves."""
     expert = expert_of(mdp, jnp.asarray(weights))
     nothing = soft_plan(mdp, jnp.zeros((mdp.n_states, mdp.n_actions)))
     return float(expected_gap(mdp, expert, jnp.zeros(mdp.n_features), nothing.values))
@@ -222,7 +225,7 @@ def ignorance_gap(mdp: TabularMDP, weights: Float[Array, " K"]) -> float:
 
 
 def full_view_coverage(
-    key: Array, setting: Setting, runs: int, size: int, confidence: float
+    key: Array, setting: Setting, replications: int, size: int, confidence: float
 ) -> list[Coverage]:
     """Theorem 1 beside the bounds from observed variances, on the same fully seen trajectories.
 
@@ -230,7 +233,7 @@ def full_view_coverage(
     """
     mdp, discount = setting.mdp, float(setting.mdp.discount)
     expert = expert_of(mdp, setting.weights)
-    features = simulate_features(key, mdp, expert, setting.length, runs, size)
+    features = simulate_features(key, mdp, expert, setting.length, replications, size)
     epsilon = error_for(size, 1 - confidence, mdp.n_features)
     theorem = me_i2rl_confidence(size, epsilon, mdp.n_features, discount)
     target = features.mean(axis=1)
@@ -238,9 +241,14 @@ def full_view_coverage(
     gaps = expected_gaps(mdp, expert, target, jnp.full_like(target, epsilon / (1 - discount)))
     rows = [
         coverage_of(
-            setting, f"{theorem.source}, its constraints", size, confidence, np.full(runs, epsilon), misses
+            setting,
+            f"{theorem.source}, its constraints",
+            size,
+            confidence,
+            np.full(replications, epsilon),
+            misses,
         ),
-        coverage_of(setting, theorem.source, size, confidence, np.full(runs, theorem.error), gaps),
+        coverage_of(setting, theorem.source, size, confidence, np.full(replications, theorem.error), gaps),
     ]
     for predictable, name in ((False, "observed variances"), (True, "observed variances, predictable")):
         rows += _observed_rows(setting, expert, features, confidence, predictable, name)
@@ -265,7 +273,7 @@ def _observed_rows(
 
 
 def occluded_coverage(
-    key: Array, setting: Setting, runs: int, size: int, draws: int, delta: float
+    key: Array, setting: Setting, replications: int, size: int, draws: int, delta: float
 ) -> list[Coverage]:
     """Lemma 2 and Theorem 2 with completions under the expert's weights, exact and sampled.
 
@@ -276,7 +284,7 @@ def occluded_coverage(
     mdp, discount, n_features = setting.mdp, float(setting.mdp.discount), setting.mdp.n_features
     expert = expert_of(mdp, setting.weights)
     walk, fill = jax.random.split(key)
-    codes = simulate_codes(walk, mdp, expert, setting.sensor, setting.length, runs, size)
+    codes = simulate_codes(walk, mdp, expert, setting.sensor, setting.length, replications, size)
     completed = complete_features(fill, mdp, expert, setting.sensor, codes, draws)
     epsilon = error_for(size, delta, n_features)
     epsilon_s = error_for(size * draws, delta, n_features)
@@ -292,16 +300,16 @@ def occluded_coverage(
         target = features.mean(axis=1)
         if error is None:
             seen = (1 - discount) * jnp.max(jnp.abs(target - expert.features), axis=1)
-            rows.append(coverage_of(setting, name, size, confidence, np.full(runs, slack), seen))
+            rows.append(coverage_of(setting, name, size, confidence, np.full(replications, slack), seen))
         else:
             gaps = expected_gaps(mdp, expert, target, jnp.full_like(target, slack / (1 - discount)))
-            rows.append(coverage_of(setting, name, size, confidence, np.full(runs, error), gaps))
+            rows.append(coverage_of(setting, name, size, confidence, np.full(replications, error), gaps))
     name = "observed variances, predictable, exact completion"
     return rows + _observed_rows(setting, expert, completed.exact, exactly.confidence, True, name)
 
 
 def learned_coverage(
-    key: Array, setting: Setting, runs: int, size: int, draws: int, delta: float, batch: int = 25
+    key: Array, setting: Setting, replications: int, size: int, draws: int, delta: float, batch: int = 25
 ) -> list[Coverage]:
     """Theorem 2 as LME-I2RL really runs: hidden steps completed under its own weights, exactly.
 
@@ -311,15 +319,21 @@ def learned_coverage(
     discount, n_features = float(setting.mdp.discount), setting.mdp.n_features
     epsilon, epsilon_s = error_for(size, delta, n_features), error_for(size * draws, delta, n_features)
     theorem = lme_i2rl_confidence(size, size * draws, epsilon, epsilon_s, n_features, discount)
-    gaps = learned_gaps(key, setting, setting.sensor, runs, size, theorem.epsilon, batch)
+    gaps = learned_gaps(key, setting, setting.sensor, replications, size, theorem.epsilon, batch)
     name = f"{theorem.source}, LME-I2RL"
-    return [coverage_of(setting, name, size, theorem.confidence, np.full(runs, theorem.error), gaps)]
+    return [coverage_of(setting, name, size, theorem.confidence, np.full(replications, theorem.error), gaps)]
 
 
 def learned_gaps(
-    key: Array, setting: Setting, assumed: AnySensor, runs: int, size: int, slack: float, batch: int = 25
-) -> Float[np.ndarray, " runs"]:
-    """Expected gaps of LME-I2RL with the features statistic, which believes in the sensor ``assumed``.
+    key: Array,
+    setting: Setting,
+    assumed: AnySensor,
+    replications: int,
+    size: int,
+    slack: float,
+    batch: int = 25,
+) -> Float[np.ndarray, " replications"]:
+    """Compute expected gaps of LME-I2RL with the features statistic and the sensor ``assumed``.
 
     ``slack`` is the ``epsilon`` of its program; ``size`` trajectories come in one session.
     """
@@ -327,9 +341,9 @@ def learned_gaps(
     learners = fleet(lme_i2rl(mdp, assumed, statistic="features", slack=slack, iterations=50))
     gap = jax.jit(jax.vmap(partial(_gap_of_weights, mdp, expert)))
     walk, begin = jax.random.split(key)
-    codes = simulate_codes(walk, mdp, expert, setting.sensor, setting.length, runs, size)
+    codes = simulate_codes(walk, mdp, expert, setting.sensor, setting.length, replications, size)
     gaps = []
-    for i in range(0, runs, batch):
+    for i in range(0, replications, batch):
         part = codes[i : i + batch]
         kind, state, action = jnp.moveaxis(part, -1, 0)
         demonstrations = Demonstration(kind, state, action, jnp.full(kind.shape, jnp.nan))  # type: ignore[arg-type]
@@ -339,7 +353,7 @@ def learned_gaps(
 
 
 def regret_coverage(
-    key: Array, setting: Setting, runs: int, c: float, sessions: int, delta: float
+    key: Array, setting: Setting, replications: int, c: float, sessions: int, delta: float
 ) -> list[Coverage]:
     """Theorem 3: average regret after every session up to the last, with sessions that grow as they must.
 
@@ -350,22 +364,29 @@ def regret_coverage(
     expert = expert_of(mdp, setting.weights)
     sizes = no_regret_sizes(c, sessions, delta, mdp.n_features, discount)
     regret = no_regret(c, sizes, mdp.n_features, discount)
-    total = jnp.zeros((runs, mdp.n_features))
+    total = jnp.zeros((replications, mdp.n_features))
     gaps = []
     for i, size in enumerate(sizes, 1):
-        features = simulate_features(jax.random.fold_in(key, i), mdp, expert, setting.length, runs, int(size))
+        features = simulate_features(
+            jax.random.fold_in(key, i), mdp, expert, setting.length, replications, int(size)
+        )
         total = total + features.sum(axis=1)
         gaps.append(expected_gaps(mdp, expert, total / sizes[:i].sum(), jnp.full_like(total, c / i)))
     average = np.cumsum(gaps, axis=0) / np.arange(1, sessions + 1)[:, None]
     confidence = float(regret.confidence[-1])
     row = coverage_of(
-        setting, regret.bound.source, sizes.sum(), confidence, np.full(runs, regret.average[-1]), average[-1]
+        setting,
+        regret.bound.source,
+        sizes.sum(),
+        confidence,
+        np.full(replications, regret.average[-1]),
+        average[-1],
     )
     return [row._replace(covered=float((average <= regret.average[:, None]).all(axis=0).mean()))]
 
 
 def coverage_table(rows: Sequence[Coverage]) -> pd.DataFrame:
-    """The rows with their looseness, labelled."""
+    """Tabulate the rows with their looseness, labelled."""
     table = pd.DataFrame([{**row._asdict(), "looseness": row.looseness} for row in rows])
     return table.set_index(["setting", "result"])
 
@@ -379,12 +400,18 @@ def coverage_of(
     result: str,
     size: int,
     confidence: float,
-    bounds: Float[np.ndarray, " runs"],
-    seen: Float[ArrayLike, " runs"],
+    bounds: Float[np.ndarray, " replications"],
+    seen: Float[ArrayLike, " replications"],
 ) -> Coverage:
     """Compare what was ``seen`` in each run with its bound."""
     seen = np.asarray(seen)
     return Coverage(
-        setting.name, result, int(size), confidence, float((seen <= bounds).mean()), float(np.median(bounds)),
-        float(np.quantile(seen, confidence, method="higher")), len(seen),
-    )  # fmt: skip
+        setting.name,
+        result,
+        int(size),
+        confidence,
+        float((seen <= bounds).mean()),
+        float(np.median(bounds)),
+        float(np.quantile(seen, confidence, method="higher")),
+        len(seen),
+    )

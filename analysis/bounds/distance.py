@@ -1,4 +1,4 @@
-"""How far reports, and posteriors over what was done, can be apart if an observation model is not exact.
+"""Distances between observations, and between posteriors of behaviour, under an inexact observation model.
 
 ``p_j`` are the reliabilities of ``|Psi|`` predicates (Eq. 6.5), known within ``epsilon_o``. Distances are
 total variations, by which the expectation of a value in [0, 1] can change.
@@ -17,7 +17,7 @@ from .checks import counted, positive
 
 
 class Perception(NamedTuple):
-    """What the bounds ask about perception.
+    """Properties of perception that the bounds need.
 
     ``observations`` used to estimate the observation model (``n_o``), its error ``epsilon_o``, the number of
     ``predicates`` (``|Psi|``), and the ``longest`` trajectory's steps (``L``).
@@ -29,13 +29,15 @@ class Perception(NamedTuple):
     longest: int
 
 
-def report_distance(perception: Perception, reliabilities: Float[np.ndarray, " J"] | None = None) -> float:
-    """How far the reports of one and the same trajectory can be apart under true and estimated reliabilities.
+def observation_distance(
+    perception: Perception, reliabilities: Float[np.ndarray, " J"] | None = None
+) -> float:
+    """Bound the distance between observations of one trajectory under true and estimated reliabilities.
 
-    Total variation, at most ``1 - (1 - epsilon_o)^(L |Psi|) <= L |Psi| epsilon_o`` (reports can be coupled so
-    that each predicate of each step differs with probability ``epsilon_o``). With the estimated
+    Total variation, at most ``1 - (1 - epsilon_o)^(L |Psi|) <= L |Psi| epsilon_o`` (a coupling of the
+    observations lets each predicate of each step differ with probability ``epsilon_o``). With the estimated
     ``reliabilities [J]`` also at most ``sqrt(1 - rho^2)``, ``rho`` the Bhattacharyya coefficient, which grows
-    with the root of ``L |Psi|`` only; the smaller is returned. Predicates are reported independently. Raises
+    with the root of ``L |Psi|`` only; the smaller is returned. Predicates are observed independently. Raises
     ``ValueError`` for an error that is not positive, or reliabilities that are not ``|Psi|`` probabilities.
     """
     coupled = _over_steps(_error(perception), perception.longest * perception.predicates)
@@ -49,12 +51,11 @@ def report_distance(perception: Perception, reliabilities: Float[np.ndarray, " J
 
 
 def posterior_distance(perception: Perception, reliabilities: Float[np.ndarray, " J"]) -> float:
-    """How far posteriors over trajectories can be apart under true and estimated reliabilities, surely.
+    """Bound the distance between posteriors over trajectories under true and estimated reliabilities, surely.
 
-    Total variation, at most ``tanh(L / 4 sum_j |logit p_j - logit p_hat_j|)``, whatever was reported,
-    whatever the weights, and however the estimate came about: likelihood ratios of two trajectories change by
-    at most the exponential of ``L`` times that sum. One where a reliability may be 0 or 1. Errors as
-    :func:`report_distance`.
+    Total variation, at most ``tanh(L / 4 sum_j |logit p_j - logit p_hat_j|)``, for all observations, weights
+    and estimates: likelihood ratios of two trajectories change by at most the exponential of ``L`` times that
+    sum. One if a reliability may be 0 or 1. Errors as :func:`report_distance`.
     """
     p, ends = _intervals(perception, reliabilities)
     if not ((ends > 0) & (ends < 1)).all():
@@ -64,23 +65,23 @@ def posterior_distance(perception: Perception, reliabilities: Float[np.ndarray, 
 
 
 class ModelDistance(NamedTuple):
-    """How far two observation models are apart, at one step.
+    """Distance of two observation models at one step.
 
     Fields
     ------
     variation : float
-        Total variation between the reports of a truth, at the worst truth. ``1 - (1 - variation)^L`` takes
-        the place of :func:`report_distance`.
+        Total variation between the observations of a truth, at the worst truth. ``1 - (1 - variation)^L``
+        takes the place of :func:`report_distance`.
     odds : float
-        By how much the logarithm of a likelihood ratio of two truths changes, at the worst report. ``tanh(L
-        odds / 4)`` takes the place of :func:`posterior_distance`.
+        Largest change of the logarithm of a likelihood ratio of two truths, at the worst observation.
+        ``tanh(L odds / 4)`` takes the place of :func:`posterior_distance`.
     """
 
     variation: float
     odds: float
 
     def over(self, steps: int) -> tuple[float, float]:
-        """Bounds of the total variation of a trajectory's reports, and of the posterior over trajectories."""
+        """Bound the total variation of a trajectory's observations, and that of the posterior."""
         counted("steps", steps)
         return _over_steps(self.variation, steps), math.tanh(steps * self.odds / 4)
 
@@ -90,7 +91,7 @@ def model_distance(
 ) -> ModelDistance:
     """Compare two observation models of any kind, at the ``truths`` that can occur (all by default).
 
-    Raises ``ValueError`` for imperfections without an observation model, or about different pairs.
+    Raises ``ValueError`` for sensors without an observation model, or about different pairs.
     """
     if one.noise is None or other.noise is None:
         raise ValueError("an imperfection without an observation model reports exactly: nothing to compare")
@@ -124,7 +125,7 @@ def _error(perception: Perception) -> float:
 def _intervals(
     perception: Perception, reliabilities: Float[np.ndarray, " J"]
 ) -> tuple[Float[np.ndarray, " J"], Float[np.ndarray, "2 J"]]:
-    """The estimates, and the ends of what each true reliability may be."""
+    """Return the estimates and the ends of their ranges of true reliabilities."""
     error, p = _error(perception), np.asarray(reliabilities, float)
     if p.shape != (perception.predicates,) or not ((p >= 0) & (p <= 1)).all():
         raise ValueError(f"reliabilities are {perception.predicates} probabilities, got {reliabilities}")

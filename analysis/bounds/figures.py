@@ -57,17 +57,27 @@ def sample_size_plot(
     if n_features == 6:
         table = table_7_1a(discount=discount)
         points = axes.plot(
-            table["error_nats"], table["trajectories"], "o", color=theme.series[0], markersize=6,
-            markeredgecolor=theme.surface, label="Table 7.1(a)",
-        )  # fmt: skip
+            table["error_nats"],
+            table["trajectories"],
+            "o",
+            color=theme.series[0],
+            markersize=6,
+            markeredgecolor=theme.surface,
+            label="Table 7.1(a)",
+        )
         handles += points
     if ignorance is not None:
         axes.axvline(ignorance, color=theme.muted, linewidth=1.2, linestyle=(0, (1, 1.5)))
         axes.annotate(
-            "right of this line,\nknowing nothing\nis as good", (ignorance, 0), (6, 6),
-            xycoords=("data", "axes fraction"), textcoords="offset points", va="bottom", fontsize=SMALL,
+            "right of this line,\nknowing nothing\nis as good",
+            (ignorance, 0),
+            (6, 6),
+            xycoords=("data", "axes fraction"),
+            textcoords="offset points",
+            va="bottom",
+            fontsize=SMALL,
             color=theme.muted,
-        )  # fmt: skip
+        )
     axes.set_xscale("log")
     axes.set_yscale("log")
     dress(axes, theme, x="error of the log-likelihood (nats per trajectory)", y="trajectories needed")
@@ -84,7 +94,7 @@ def sample_size_plot(
 
 
 def looseness_plot(rows: Sequence[Coverage], *, theme: Theme = LIGHT, title: str = "") -> Figure:
-    """What each bound promises beside the quantile of what happened, one line a bound.
+    """Draw the promise of each bound beside the quantile observed, one line a bound.
 
     Bounds of one picture should share their unit (nats per trajectory).
     """
@@ -96,9 +106,14 @@ def looseness_plot(rows: Sequence[Coverage], *, theme: Theme = LIGHT, title: str
     for height, row in zip(heights, rows, strict=True):
         axes.plot([row.quantile, row.bound], [height, height], color=theme.grid, linewidth=3, zorder=1)
         axes.annotate(
-            f"{number(row.looseness)} times", (row.bound, height), (7, 0), textcoords="offset points",
-            va="center", fontsize=SMALL, color=theme.muted,
-        )  # fmt: skip
+            f"{number(row.looseness)} times",
+            (row.bound, height),
+            (7, 0),
+            textcoords="offset points",
+            va="center",
+            fontsize=SMALL,
+            color=theme.muted,
+        )
     axes.plot([r.quantile for r in rows], heights, linestyle="none", marker="o", color=theme.series[0])
     axes.plot([r.bound for r in rows], heights, linestyle="none", marker="s", color=theme.series[1])
     name_ticks(
@@ -117,5 +132,5 @@ def looseness_plot(rows: Sequence[Coverage], *, theme: Theme = LIGHT, title: str
         )
     ]
     head(figure, theme, handles, title=title, columns=2)
-    foot(figure, theme, f"{counted(rows[0].runs, 'simulated run')} each")
+    foot(figure, theme, f"{counted(rows[0].replications, 'simulated replication')} each")
     return figure

@@ -1,8 +1,8 @@
-"""Repeated simulated runs against RIMEO's bounds: :mod:`.coverage` under noisy, estimated perception.
+"""Replications against RIMEO's bounds: :mod:`.coverage` under noisy, estimated perception.
 
-The expert obeys the soft model; reports follow :class:`~i2rl.models.FeatureNoise` whose reliabilities are
-counted on ``n_o`` reports of known truth, as nothing else gives Hoeffding's ``epsilon_o``. Posteriors over
-what was done are exact.
+The expert obeys the soft model; observations follow :class:`~i2rl.models.FeatureNoise`. Its reliabilities are
+counted on ``n_o`` observations of known truth, as Hoeffding's ``epsilon_o`` requires. Posteriors over pairs
+are exact.
 """
 
 from __future__ import annotations
@@ -42,17 +42,19 @@ from .theorems import error_for
 
 
 def noise_of(setting: Setting) -> FeatureNoise:
-    """The setting's noise on predicates; ``ValueError`` for another sensor."""
+    """Return the setting's noise on predicates; ``ValueError`` for another sensor."""
     if not isinstance(setting.sensor, FeatureNoise):
         raise ValueError(f"the study is of FeatureNoise, but the sensor is a {type(setting.sensor).__name__}")
     return setting.sensor
 
 
-def counted_reliabilities(key: Array, noise: FeatureNoise, runs: int, reports: int) -> Float[Array, "runs J"]:
-    """Shares of ``reports`` that have each predicate right, as counted where the truth is known.
+def counted_reliabilities(
+    key: Array, noise: FeatureNoise, replications: int, observations: int
+) -> Float[Array, "replications J"]:
+    """Count shares of right predicates among ``observations`` of known truth.
 
-    Half a report is the least and the most short of all. Raises ``ValueError`` unless predicates are reported
-    independently, which takes that every combination of them can be reported, equally often.
+    Shares stay half an observation away from 0 and 1. Raises ``ValueError`` unless predicates are observed
+    independently, which requires that every combination of them can be observed, equally often.
     """
     classes = predicate_classes(np.asarray(noise.predicates), np.asarray(noise.reportable))
     if len(classes.vectors) != 2 ** len(noise.predicates) or np.ptp(classes.reportable) > 0:
@@ -62,8 +64,8 @@ def counted_reliabilities(key: Array, noise: FeatureNoise, runs: int, reports: i
             f"{classes.reportable.max():g} pairs: predicates are not independent, and reliabilities no shares"
         )
     p = noise.reliabilities
-    right = jax.random.binomial(key, reports, p, (runs, len(p)))
-    return jnp.clip(right, 0.5, reports - 0.5) / reports
+    right = jax.random.binomial(key, observations, p, (replications, len(p)))
+    return jnp.clip(right, 0.5, observations - 0.5) / observations
 
 
 @partial(jax.jit, static_argnames=("draws",))
@@ -72,8 +74,8 @@ def complete_under(
     mdp: TabularMDP,
     expert: Expert,
     noise: FeatureNoise,
-    reliabilities: Float[Array, "runs J"],
-    codes: Int[Array, "runs size L 3"],
+    reliabilities: Float[Array, "replications J"],
+    codes: Int[Array, "replications size L 3"],
     draws: int,
 ) -> Completed:
     """:func:`~i2rl.analysis.bounds.coverage.complete_features` of each run under its own reliabilities."""
@@ -88,20 +90,20 @@ def complete_under(
 
 
 def perception_coverage(
-    key: Array, setting: Setting, runs: int, size: int, draws: int, reports: int, delta: float
+    key: Array, setting: Setting, replications: int, size: int, draws: int, observations: int, delta: float
 ) -> list[Coverage]:
-    """Lemma 4 and Theorem 6 (Lemma 8 and Theorem 6 of appendix E), printed and corrected.
+    """Simulate Lemma 4 and Theorem 6 (Lemma 8 and Theorem 6 of appendix E), printed and corrected.
 
     ``delta`` is spent on each of ``epsilon`` (``size`` trajectories), ``epsilon_s`` (``size * draws`` sampled
-    completions in all) and ``epsilon_o`` (``reports``), which decide the errors. Hidden pairs are filled in
-    under the expert's weights. Raises ``ValueError`` as :func:`counted_reliabilities`.
+    completions in all) and ``epsilon_o`` (``observations``), which determine the errors. Hidden pairs are
+    filled in under the expert's weights. Raises ``ValueError`` as :func:`counted_reliabilities`.
     """
     mdp, discount, n_features = setting.mdp, float(setting.mdp.discount), setting.mdp.n_features
     noise, expert = noise_of(setting), expert_of(mdp, setting.weights)
     n_predicates = len(noise.predicates)
     walk, count, fill = jax.random.split(key, 3)
-    codes = simulate_codes(walk, mdp, expert, noise.noise, setting.length, runs, size)
-    counted = counted_reliabilities(count, noise, runs, reports)
+    codes = simulate_codes(walk, mdp, expert, noise.noise, setting.length, replications, size)
+    counted = counted_reliabilities(count, noise, replications, observations)
     completed = complete_under(fill, mdp, expert, noise, counted, codes, draws)
     epsilon, epsilon_s = error_for(size, delta, n_features), error_for(size * draws, delta, n_features)
 
@@ -112,45 +114,59 @@ def perception_coverage(
         return [
             coverage_of(setting, f"Lemma 4, {name}", size, confidence, np.asarray(slack), missed),
             coverage_of(
-                setting, f"Theorem 6, {name}", size, confidence, np.asarray(errors),
+                setting,
+                f"Theorem 6, {name}",
+                size,
+                confidence,
+                np.asarray(errors),
                 expected_gaps(mdp, expert, target, slacks),
             ),
-        ]  # fmt: skip
+        ]
 
     # The printed delta_o counts every feature.
     printed = Perception(
-        reports, error_for(reports, delta, n_features * n_predicates), n_predicates, setting.length
+        observations, error_for(observations, delta, n_features * n_predicates), n_predicates, setting.length
     )
     sizes = (size, size * draws, epsilon, epsilon_s, printed, n_features)
     lemma, theorem = rimeo_constraint_bound(*sizes), rimeo_confidence(*sizes, discount)
     found = rows(
-        "printed", completed.sampled, theorem.confidence, jnp.full(runs, lemma.error),
-        jnp.full(runs, theorem.error),
-    )  # fmt: skip
-    once = printed._replace(epsilon_o=error_for(reports, delta, n_predicates))
+        "printed",
+        completed.sampled,
+        theorem.confidence,
+        jnp.full(replications, lemma.error),
+        jnp.full(replications, theorem.error),
+    )
+    once = printed._replace(epsilon_o=error_for(observations, delta, n_predicates))
     ahead = noisy_constraint_bound(size, epsilon, once, n_features)
     for name, lemmas in (
-        ("corrected", [ahead] * runs),
-        ("counted reliabilities", [noisy_constraint_bound(size, epsilon, once, n_features, p)
-                                   for p in np.asarray(counted)]),
-        ("same reports", [same_reports_constraint_bound(size, epsilon, once, n_features, p)
-                          for p in np.asarray(counted)]),
-    ):  # fmt: skip
+        ("corrected", [ahead] * replications),
+        (
+            "counted reliabilities",
+            [noisy_constraint_bound(size, epsilon, once, n_features, p) for p in np.asarray(counted)],
+        ),
+        (
+            "same reports",
+            [same_reports_constraint_bound(size, epsilon, once, n_features, p) for p in np.asarray(counted)],
+        ),
+    ):
         theorems = [noisy_confidence(x, n_features, discount) for x in lemmas]
         found += rows(
-            name, completed.exact, ahead.confidence, jnp.asarray([x.error for x in lemmas]),
+            name,
+            completed.exact,
+            ahead.confidence,
+            jnp.asarray([x.error for x in lemmas]),
             jnp.asarray([x.error for x in theorems]),
-        )  # fmt: skip
+        )
     return found
 
 
 def learned_perception_coverage(
     key: Array,
     setting: Setting,
-    runs: int,
+    replications: int,
     size: int,
     draws: int,
-    reports: int,
+    observations: int,
     delta: float,
     shift: float = 1.0,
 ) -> list[Coverage]:
@@ -166,33 +182,35 @@ def learned_perception_coverage(
     noise = noise_of(setting)
     n_predicates = len(noise.predicates)
     perception = Perception(
-        reports, error_for(reports, delta, n_features * n_predicates), n_predicates, setting.length
+        observations, error_for(observations, delta, n_features * n_predicates), n_predicates, setting.length
     )
     epsilon, epsilon_s = error_for(size, delta, n_features), error_for(size * draws, delta, n_features)
     theorem = rimeo_confidence(size, size * draws, epsilon, epsilon_s, perception, n_features, discount)
     p = np.asarray(noise.reliabilities) + shift * perception.epsilon_o
     gaps = learned_gaps(
-        key, setting, FeatureNoise(noise.predicates, p, noise.reportable), runs, size, theorem.epsilon
+        key, setting, FeatureNoise(noise.predicates, p, noise.reportable), replications, size, theorem.epsilon
     )
     name = f"Theorem 6, own weights, reliabilities off by {shift:+g} epsilon_o"
-    return [coverage_of(setting, name, size, theorem.confidence, np.full(runs, theorem.error), gaps)]
+    return [coverage_of(setting, name, size, theorem.confidence, np.full(replications, theorem.error), gaps)]
 
 
-def posterior_change(key: Array, setting: Setting, epsilon_o: float, runs: int, size: int) -> list[Coverage]:
-    """The proof's step from the true model to one within ``epsilon_o`` of it, said to hold of every report.
+def posterior_change(
+    key: Array, setting: Setting, epsilon_o: float, replications: int, size: int
+) -> list[Coverage]:
+    """Check the proof's step from the true model to one within ``epsilon_o`` of it, for every observation.
 
-    Reliabilities are off by ``epsilon_o`` to a random side. What is seen is the largest change of a feature's
-    ``(1 - gamma) phi_hat`` between the two posteriors, over ``size`` trajectories of a run and of its worst
-    trajectory alone; it is held to ``L |Psi| epsilon_o`` and to the bound by odds (:func:`.model_distance`),
-    both surely. Any :class:`~i2rl.models.FeatureNoise` will do. Raises ``ValueError`` for reliabilities
+    Reliabilities are off by ``epsilon_o`` to a random side. The result is the largest change of a feature's
+    ``(1 - gamma) phi_hat`` between the two posteriors, over ``size`` trajectories of a replication and of its
+    worst trajectory alone, against ``L |Psi| epsilon_o`` and the bound by odds (:func:`.model_distance`),
+    both sure. Every :class:`~i2rl.models.FeatureNoise` is allowed. Raises ``ValueError`` for reliabilities
     within ``epsilon_o`` of 0 or 1.
     """
     mdp, unit = setting.mdp, 1 - float(setting.mdp.discount)
     noise, expert = noise_of(setting), expert_of(mdp, setting.weights)
     walk, side, fill = jax.random.split(key, 3)
-    codes = simulate_codes(walk, mdp, expert, noise.noise, setting.length, runs, size)
+    codes = simulate_codes(walk, mdp, expert, noise.noise, setting.length, replications, size)
     true = noise.reliabilities
-    off = true + epsilon_o * jax.random.rademacher(side, (runs, len(true)), float)
+    off = true + epsilon_o * jax.random.rademacher(side, (replications, len(true)), float)
     if not bool(((off > 0) & (off < 1)).all()):
         raise ValueError(f"reliabilities {np.asarray(true)} are too near 0 or 1 to be off by {epsilon_o}")
     before, after = (
@@ -206,7 +224,7 @@ def posterior_change(key: Array, setting: Setting, epsilon_o: float, runs: int, 
             for p in np.asarray(off)
         ]
     )
-    printed = np.full(runs, setting.length * len(true) * epsilon_o)
+    printed = np.full(replications, setting.length * len(true) * epsilon_o)
     mean, single = np.abs(change.mean(axis=1)).max(axis=1), np.abs(change).max(axis=(1, 2))
     return [
         coverage_of(setting, f"observation term {name}, {what}", count, 1.0, bounds, seen)

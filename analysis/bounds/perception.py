@@ -1,46 +1,47 @@
-"""Bounds under noisy perception whose observation model is estimated (chapter 6.1, appendix E): RIMEO's.
+"""Bounds of RIMEO, for noisy perception with an estimated observation model (chapter 6.1, appendix E).
 
 Printed and corrected statements stand side by side; notation is that of
 :mod:`~i2rl.analysis.bounds.theorems`. ``p_j`` are the reliabilities of the ``|Psi|`` predicates, ``O(o | g)``
-the observation model that they make (Eq. 6.5), ``L`` the steps of the longest trajectory, ``n_o`` the reports
-that the model was estimated from.
+the observation model that they make (Eq. 6.5), ``L`` the steps of the longest trajectory, ``n_o`` the
+observations that the model was estimated from.
 
-What Lemma 4 (Lemma 8 of appendix E) says, read closely. Its term ``L |Psi| epsilon_o`` can be proved, though
-not as printed, and of something else than what is printed:
+Lemma 4 (Lemma 8 of appendix E) in detail. Its term ``L |Psi| epsilon_o`` can be proved in another form than
+the printed one, and for another quantity:
 
-- ``epsilon_o`` is said to bound ``|O - O_hat|`` at the pairs that were observed, and the error at every other
-  pair is said to be ``|Psi|`` times that. Products that agree say nothing of their factors: reliabilities
-  (0.9, 0.1) and (0.1, 0.9) give a report with both predicates right the same 0.09, and one with only the
-  first right 0.81 or 0.01. If ``epsilon_o`` bounds the error of each *reliability*, then reports of one truth
-  differ by at most ``|Psi| epsilon_o`` in total variation, and ``L |Psi| epsilon_o`` over a trajectory.
-- Hoeffding's inequality is about a mean of values whose expectation is what is estimated. Matches counted
-  where the truth is known are such; a running average of scores (Eq. 6.6) is not, and without truths or
-  scores the reliabilities need not be identified at all.
+- The lemma lets ``epsilon_o`` bound ``|O - O_hat|`` at the observed pairs, and assigns every other pair
+  ``|Psi|`` times that error. Equal products do not determine their factors: reliabilities (0.9, 0.1) and
+  (0.1, 0.9) give an observation with both predicates right the same 0.09, and one with only the first right
+  0.81 or 0.01. If ``epsilon_o`` bounds the error of each *reliability*, then observations of one truth differ
+  by at most ``|Psi| epsilon_o`` in total variation, and ``L |Psi| epsilon_o`` over a trajectory.
+- Hoeffding's inequality concerns a mean of values whose expectation is the estimand. Matches counted against
+  a known truth are such values; a running average of scores (Eq. 6.6) is not, and without truths or scores
+  the reliabilities may be unidentified.
 - The posterior's normaliser ``eta`` belongs to a model; the proof gives both models the same one, and then
   drops it from ``sum_xi f_k(xi) eta P(xi) <= 1 / (1 - gamma)``, although it is the inverse probability of the
-  report and as large as the report is rare. For the trajectories that were seen, the term is therefore no
-  bound: one predicate, one step, a truth of probability 0.01, reliabilities 0.99 and 0.995, and the report
-  that it holds moves the posterior by 0.17 instead of 0.005. *In expectation over reports* it is a bound.
-  With ``P`` and ``P_hat`` the laws of reports under the two models and the expert's behaviour, ``E_P[phi_hat]
+  observation, large for a rare one. For the observed trajectories the term therefore fails: with one
+  predicate, one step, a truth of probability 0.01, reliabilities 0.99 and 0.995, the observation that it
+  holds moves the posterior by 0.17 instead of 0.005. *In expectation over observations* it is a bound. With
+  ``P`` and ``P_hat`` the laws of observations under the two models and the expert's behaviour, ``E_P[phi_hat]
   - E[phi] = sum_o (P(o) - P_hat(o)) phi_hat(o)``, because ``E_P_hat[phi_hat] = E[phi]``: at most the total
-  variation of the two laws, which is at most that of the reports of one truth.
-- That needs the expert's weights in the posterior, and a model that does not depend on the reports it is used
-  on. Without the latter, or for the posterior's change itself, only odds help: :func:`.posterior_distance`.
-- RIMEO's posterior is under its own weights, and then no bound of this form holds. The printed one does not
-  depend on how noisy perception is. At reliabilities of 1/2, known exactly, the posterior is the prior, all
-  weights reproduce themselves, and the program with slack returns zero: what is lost is what knowing nothing
-  loses, however many trajectories there are. The study of coverage has it happen at 0.6 too.
+    variation of the two laws, which is at most that of the observations of one truth.
+- That requires the expert's weights in the posterior, and a model independent of the observations that it
+  explains. Without the latter, or for the posterior's change itself, only odds give a bound:
+  :func:`.posterior_distance`.
+- RIMEO's posterior uses its own weights, and then no bound of this form holds. The printed one does not
+  depend on the noise of perception. At reliabilities of 1/2, known exactly, the posterior is the prior, all
+  weights reproduce themselves, and the program with slack returns zero: the loss is that of ignorance, for
+  every number of trajectories. The study of coverage shows this at 0.6 too.
 - ``delta_o`` counts every feature ``k``, although one event (all reliabilities are within ``epsilon_o``)
   makes the term hold for all of them: ``2 |Psi| exp(-2 n_o epsilon_o^2)`` is enough. ``epsilon_s`` and
-  ``delta_s`` are needless as they are in Lemma 2: the posterior's expected features, or those of any number
-  of completions drawn from it, are independent values in [0, 1] themselves.
-- Discounting does not shorten ``L``: a report of a late step is evidence about early ones. The features'
-  discounted sum has the range ``1 / (1 - gamma)`` however late the error is.
-- Eq. 6.5 is a distribution over reports only if every combination of predicates can be reported. Normalised
-  over those that can, a reliability is a parameter and ``|Psi| epsilon_o`` no bound; :func:`.model_distance`
-  measures what takes the place of ``epsilon_o |Psi|``.
-- The features of earlier sessions are not completed again when the model improves (Eq. 6.9): ``n_o`` is what
-  the model of the *first* session was estimated from, or ``epsilon_o`` an average over sessions.
+  ``delta_s`` are superfluous, as in Lemma 2: the posterior's expected features, or those of any number of
+  completions drawn from it, are independent values in [0, 1] themselves.
+- Discounting does not shorten ``L``: the observation of a late step is evidence about early ones. The
+  features' discounted sum has the range ``1 / (1 - gamma)`` for late errors, too.
+- Eq. 6.5 is a distribution over observations only if every combination of predicates can be observed.
+  Normalised over the possible combinations, a reliability is a parameter and ``|Psi| epsilon_o`` no bound;
+  :func:`.model_distance` measures the replacement of ``epsilon_o |Psi|``.
+- The features of earlier sessions are not completed again when the model improves (Eq. 6.9): ``n_o`` counts
+  the observations behind the model of the *first* session, or ``epsilon_o`` is an average over sessions.
 """
 
 from __future__ import annotations
@@ -71,7 +72,7 @@ from .assumptions import (
     Bound,
 )
 from .checks import counted, counted_sessions, discounted, positive, probability
-from .distance import Perception, posterior_distance, report_distance
+from .distance import Perception, observation_distance, posterior_distance
 from .theorems import (
     Regret,
     failure_probability,
@@ -120,14 +121,14 @@ def noisy_constraint_bound(
     n_features: int,
     reliabilities: Float[np.ndarray, " J"] | None = None,
 ) -> Bound:
-    """Lemma 4 corrected: ``(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + d`` for all ``k``.
+    """Bound by Lemma 4 corrected: ``(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + d`` for all ``k``.
 
     With probability at least ``max(0, 1 - delta - delta_o)``, ``delta_o = 2 |Psi| exp(-2 n_o epsilon_o^2)``,
     and ``d`` the :func:`.report_distance`, smaller if the estimated ``reliabilities [J]`` are given.
     ``phi_hat`` is the posterior's, exact or of independent draws from it, under the expert's weights and
-    reliabilities counted on ``n_o`` other reports whose truth was known.
+    reliabilities counted on ``n_o`` other observations of known truth.
     """
-    distance = report_distance(perception, reliabilities)
+    distance = observation_distance(perception, reliabilities)
     return _corrected(size, epsilon, distance, perception, n_features, (OTHER_REPORTS,))
 
 
@@ -138,9 +139,9 @@ def same_reports_constraint_bound(
     n_features: int,
     reliabilities: Float[np.ndarray, " J"],
 ) -> Bound:
-    """:func:`noisy_constraint_bound` with ``d`` the :func:`.posterior_distance`.
+    """Bound as :func:`noisy_constraint_bound`, with ``d`` the :func:`.posterior_distance`.
 
-    Reliabilities may then come from the very reports that the posterior is of.
+    Reliabilities may then come from the observations that the posterior explains.
     """
     distance = posterior_distance(perception, reliabilities)
     return _corrected(size, epsilon, distance, perception, n_features, ())
@@ -173,14 +174,13 @@ def rimeo_confidence(
     n_features: int,
     discount: float,
 ) -> Bound:
-    """Theorem 1 (chapter 6), Theorem 6 (appendix E), as printed: confidence for RIMEO.
+    """Bound by Theorem 1 (chapter 6), Theorem 6 (appendix E), as printed: confidence for RIMEO.
 
     ``LL(theta_E) - LL(theta^i) <= 2 K epsilon_r / (1 - gamma)`` with probability ``max(0, 1 - delta_r)``. The
-    likelihood is that of the completed trajectories (the proof's ``Q``), not of the reports. The program's
-    slack has to be ``epsilon_r / (1 - gamma)``; the proof starts with ``epsilon / (1 - gamma)``, for which
-    the step that it cites does not hold. It also takes ``|theta|_1 = 1``, of which ``2 epsilon_r / (1 -
-    gamma)`` follows: the factor ``K`` belongs to weights in [0, 1]^K (:func:`noisy_confidence` has it as
-    ``norm``).
+    likelihood is that of the completed trajectories (the proof's ``Q``), not of the observations. The
+    program's slack has to be ``epsilon_r / (1 - gamma)``; the proof starts with ``epsilon / (1 - gamma)``,
+    for which the cited step fails. It also takes ``|theta|_1 = 1``, which gives ``2 epsilon_r / (1 -
+    gamma)``: the factor ``K`` belongs to weights in [0, 1]^K (:func:`noisy_confidence` has it as ``norm``).
     """
     lemma = rimeo_constraint_bound(size, draws, epsilon, epsilon_s, perception, n_features)
     return Bound(
@@ -215,12 +215,12 @@ def noisy_confidence(lemma: Bound, n_features: int, discount: float, norm: float
 def perception_needed(
     n_features: int, predicates: int, longest: int, error: float, confidence: float
 ) -> pd.DataFrame:
-    """Data for ``(1 - gamma) |E[phi_k] - phi_hat_k| <= error``, as printed and corrected.
+    """Compute the data for ``(1 - gamma) |E[phi_k] - phi_hat_k| <= error``, as printed and corrected.
 
-    ``error`` and what is left of ``confidence`` are shared equally by the terms. Returns a table with rows
-    ``printed`` and ``corrected`` and columns ``trajectories``, ``draws`` (of completions), ``reports``
-    (``n_o``) and ``epsilon_o``. Raises ``ValueError`` for an error outside (0, 1], a confidence outside (0,
-    1), or counts below 1.
+    The terms share ``error`` and the rest of ``confidence`` equally. Returns a table with rows ``printed``
+    and ``corrected`` and columns ``trajectories``, ``draws`` (of completions), ``observations`` (``n_o``) and
+    ``epsilon_o``. Raises ``ValueError`` for an error outside (0, 1], a confidence outside (0, 1), or counts
+    below 1.
     """
     counted("predicates", predicates), counted("longest", longest)
     if not 0 < error <= 1:
@@ -233,7 +233,7 @@ def perception_needed(
         ("printed", math.ceil(share), math.ceil(share), math.ceil(known[0]), printed),
         ("corrected", math.ceil(half), 0, math.ceil(known[1]), corrected),
     ]
-    columns = ["bound", "trajectories", "draws", "reports", "epsilon_o"]
+    columns = ["bound", "trajectories", "draws", "observations", "epsilon_o"]
     return pd.DataFrame(rows, columns=columns).set_index("bound")
 
 
@@ -250,32 +250,38 @@ def rimeo_no_regret(
     n_features: int,
     discount: float,
 ) -> Regret:
-    """Theorem 2 (chapter 6), Theorem 7 (appendix E): regret with ``epsilon_{r,i} = c (1 - gamma) / i``.
+    """Bound by Theorem 2 (chapter 6), Theorem 7 (appendix E): regret with ``epsilon_{r,i} = c (1 - gamma) /
+    i``.
 
     The relaxation is spent in thirds on ``epsilon``, ``epsilon_s`` and ``L |Psi| epsilon_o`` (the
     dissertation leaves it open). ``session_sizes [T]`` are the trajectories of each session,
-    ``session_draws [T]`` the draws ``n_s`` in it, ``session_observations [T]`` what it adds to ``n_o``. What
-    :func:`~i2rl.analysis.bounds.theorems.no_regret` says of ``log T``, of products and of growing sessions
-    holds of all three, see :func:`rimeo_no_regret_sizes`. Besides, ``phi_hat`` averages over sessions (Eq.
-    6.9), of which the early ones were completed with the early models: for ``epsilon_{o,i}`` falling as ``1 /
-    i`` and sessions of one size the average falls as ``log T / T`` only. The theorem holds of a learner that
-    completes all sessions again.
+    ``session_draws [T]`` the draws ``n_s`` in it, ``session_observations [T]`` the observations it adds to
+    ``n_o``. The remarks of :func:`~i2rl.analysis.bounds.theorems.no_regret` on ``log T``, products and
+    growing sessions hold for all three, see :func:`rimeo_no_regret_sizes`. Besides, ``phi_hat`` averages over
+    sessions (Eq. 6.9), of which the early ones were completed with the early models: for ``epsilon_{o,i}``
+    falling as ``1 / i`` and sessions of one size the average falls as ``log T / T`` only. The theorem holds
+    for a learner that completes all sessions again.
     """
     counted("predicates", predicates), counted("longest", longest)
     plain = no_regret(c, session_sizes, n_features, discount)
     i = np.arange(1, len(plain.average) + 1)
     third = c * (1 - discount) / i / 3
-    draws, reports = counted_sessions(session_draws), counted_sessions(session_observations)
-    if not len(draws) == len(reports) == len(i):
+    draws, observations = counted_sessions(session_draws), counted_sessions(session_observations)
+    if not len(draws) == len(observations) == len(i):
         raise ValueError(
-            f"{len(i)} session sizes, but {len(draws)} numbers of draws and {len(reports)} of observations"
+            f"{len(i)} session sizes, but {len(draws)} numbers of draws "
+            f"and {len(observations)} of observations"
         )
     epsilon_o = third / (longest * predicates)
-    delta = 2 * n_features * (
-        np.exp(-2 * np.cumsum(counted_sessions(session_sizes)) * third**2)
-        + np.exp(-2 * draws * third**2)
-        + predicates * np.exp(-2 * np.cumsum(reports) * epsilon_o**2)
-    )  # fmt: skip
+    delta = (
+        2
+        * n_features
+        * (
+            np.exp(-2 * np.cumsum(counted_sessions(session_sizes)) * third**2)
+            + np.exp(-2 * draws * third**2)
+            + predicates * np.exp(-2 * np.cumsum(observations) * epsilon_o**2)
+        )
+    )
     confidence = np.cumprod(np.maximum(0.0, 1 - delta))
     bound = plain.bound._replace(
         source="Theorem 7 of appendix E",
@@ -289,10 +295,11 @@ def rimeo_no_regret(
 def rimeo_no_regret_sizes(
     c: float, sessions: int, delta: float, predicates: int, longest: int, n_features: int, discount: float
 ) -> pd.DataFrame:
-    """Trajectories, draws and reports of each session with which Theorem 7's confidence stays ``1 - delta``.
+    """Compute each session's trajectories, draws and observations that hold Theorem 7's confidence at ``1 -
+    delta``.
 
     The failure probability is spent as in :func:`~i2rl.analysis.bounds.theorems.no_regret_sizes`, in thirds:
-    what a session adds grows about linearly, its draws with the square. Indexed by session, from 1.
+    the additions of a session grow about linearly, its draws with the square. Indexed by session, from 1.
     """
     positive("c", c), counted("sessions", sessions), counted("n_features", n_features)
     counted("predicates", predicates), counted("longest", longest)
@@ -305,7 +312,7 @@ def rimeo_no_regret_sizes(
         {
             "trajectories": np.diff(np.ceil(size), prepend=0).astype(int),
             "draws": np.ceil(size).astype(int),
-            "reports": np.diff(np.ceil(known), prepend=0).astype(int),
+            "observations": np.diff(np.ceil(known), prepend=0).astype(int),
         },
         index=pd.Index(i, name="session"),
     )

@@ -1,23 +1,22 @@
 """Average regret of an online learner (Definition 8) with constant and with diminishing thresholds.
 
-The log-likelihood given away in a session comes in two honest forms, both in nats per trajectory:
+A session's loss of log-likelihood has two forms, both in nats per trajectory:
 
 empirical
-    ``LL(theta_E | X_{1:i}) - LL(theta^i | X_{1:i})`` on the learner's own statistic, chapter 4's. The
-    learner fits that data, so this is usually negative; where its program is convex and solved (the
-    ``features`` statistic of whole, fully observed trajectories) it is surely at most ``sum_k beta_k
-    |theta_E,k|``, with no probability involved.
+    ``LL(theta_E | X_{1:i}) - LL(theta^i | X_{1:i})`` on the learner's own statistic, chapter 4's. The learner
+    fits that data, so this is usually negative; if its program is convex and solved (the ``features``
+    statistic of whole, fully observed trajectories) it is surely at most ``sum_k beta_k |theta_E,k|``, with
+    no probability involved.
 expected
-    The same difference under the expert's own law: the excess risk of ``theta^i``. By Gibbs' inequality it
-    is never negative, and it is what a regret should be: what the learner's estimate costs on fresh data.
-    It equals ``sum_s d(s) KL(pi_E(.|s) || pi_theta(.|s))``, with ``d`` the expert's visits: discounted
-    ones for ``features``, those of one trajectory for ``counts``, and of them those in view for ``seen``.
+    The same difference under the expert's own law: the excess risk of ``theta^i``. By Gibbs' inequality it is
+    at least zero, and it is the regret proper: the cost of the learner's estimate on fresh data. It equals
+    ``sum_s d(s) KL(pi_E(.|s) || pi_theta(.|s))``, with ``d`` the expert's visits: discounted ones for
+    ``features``, those of one trajectory for ``counts``, and of them those in view for ``seen``.
 
 Theorem 5 (Theorem 3 of chapter 4) is about the expected form: it promises ``O(log T) / T`` for thresholds
 ``epsilon_i / (1 - gamma) = c / i`` with probability ``prod_i max(0, 1 - delta_i)``. With a fixed number of
-trajectories a session that probability is 0 from some session on, see :func:`last_confident_session`; what
-is left without a condition is the sure bound of the empirical form. What is measured here is the regret
-itself, not its bound.
+trajectories a session that probability is 0 from some session on, see :func:`last_confident_session`; only
+the sure bound of the empirical form is unconditional. This module measures the regret itself, not its bound.
 """
 
 from __future__ import annotations
@@ -52,7 +51,8 @@ from ..judging.metrics import quantile_band
 def expected_visits(
     mdp: TabularMDP, policy: Float[Array, "S A"], length: int, windows: int = 1
 ) -> Float[Array, "S A"]:
-    """Expected visits of one trajectory: the mean over ``windows`` consecutive ones of ``length`` steps.
+    """Compute the expected visits of one trajectory: the mean over ``windows`` consecutive ones of ``length``
+    steps.
 
     The first begins in the initial distribution and every other where the one before ended, as fragments of
     one long walk do; ``windows = 1`` is for trajectories that all start anew. Raises ``ValueError`` for
@@ -78,7 +78,7 @@ def excess_risk(
     visits: Float[Array, "S A"],
     weights: Float[Array, " K"],
 ) -> Float[Array, ""]:
-    """``sum_s d(s) KL(pi(.|s) || pi_theta(.|s))``: nats per trajectory lost by predicting with ``weights``.
+    """Compute ``sum_s d(s) KL(pi(.|s) || pi_theta(.|s))``: nats per trajectory lost by ``weights``.
 
     ``policy`` is the expert's (any policy; zero risk is within reach only if some weights have it as their
     soft policy), ``visits [S, A]`` its expected visits. With the discounted occupancy and the soft policy
@@ -194,7 +194,8 @@ def sure_bound(beta: Float[np.ndarray, " T"], expert_weights: Float[np.ndarray, 
 
 
 def last_confident_session(c: float, session_size: int, n_features: int, discount: float) -> int:
-    """The last session of Theorem 5 with ``delta_i < 1``, for ``session_size`` trajectories in every session.
+    """Find the last session of Theorem 5 with ``delta_i < 1``, for ``session_size`` trajectories in every
+    session.
 
     ``delta_i = 2 K exp(-2 m i (c (1 - gamma) / i)^2)`` grows with ``i`` towards ``2 K > 1`` and passes 1 at
     ``i = 2 m c^2 (1 - gamma)^2 / log 2K``. From the next session on the theorem's confidence, a product
@@ -208,7 +209,7 @@ def last_confident_session(c: float, session_size: int, n_features: int, discoun
 
 
 class RegretCurve(NamedTuple):
-    """One threshold's runs: expected and empirical average regret ``[R, T]``, and its name."""
+    """One threshold's replications: expected and empirical average regret ``[R, T]``, and its name."""
 
     name: str
     expected: Float[np.ndarray, "R T"]
@@ -234,9 +235,9 @@ def regret_plot(
 ) -> Figure:
     """Average regret against sessions: expected, on log-log axes with fitted slopes, and empirical.
 
-    Lines are medians over runs, bands hold ``coverage`` of them; the slope is that of the mean over runs.
-    ``theorem`` is drawn with the expected form, ``sure`` bounds, by the name of their curve, with the other.
-    Raises ``ValueError`` for curves of different lengths.
+    Lines are medians over replications, bands hold ``coverage`` of them; the slope is that of the mean over
+    replications. ``theorem`` is drawn with the expected form, ``sure`` bounds, by the name of their curve,
+    with the other. Raises ``ValueError`` for curves of different lengths.
     """
     bounds = {} if sure is None else sure
     lengths = {np.shape(c.expected)[-1] for c in curves} | {len(bound) for bound in bounds.values()}
@@ -273,12 +274,13 @@ def regret_plot(
     _label(left, theme, "Expected: excess risk, never negative")
     _label(right, theme, "Empirical: on the learner's own data")
     head(figure, theme, handles + surely, title=title, columns=3)
-    runs = np.shape(curves[0].expected)[0]
+    replications = np.shape(curves[0].expected)[0]
     foot(
-        figure, theme,
-        f"lines: medians of {counted(runs, 'stream')}; bands: central {coverage:.0%}; "
+        figure,
+        theme,
+        f"lines: medians of {counted(replications, 'stream')}; bands: central {coverage:.0%}; "
         f"slopes: least squares of the mean over every T from {burn_in} on",
-    )  # fmt: skip
+    )
     return figure
 
 

@@ -18,12 +18,11 @@ _SYMBOLS = {True: "holds", False: "does not hold", None: "yours to answer for"}
 
 
 class Answer(NamedTuple):
-    """Trajectories by bound for one ``confidence``, the theorem's bound at its own number of them, and what
-    knowing nothing achieves.
+    """Numbers of trajectories by bound for one ``confidence``, and the error of ignorance.
 
-    Where the expert is known, ``ignorance_nats`` is the expected log-likelihood gap of zero weights, and
-    ``informative`` the trajectories from which on each bound promises less than that. ``perception`` is what
-    the same error takes under noisy perception (:func:`.perception_needed`), where that was asked for.
+    For a known expert, ``ignorance_nats`` is the expected log-likelihood gap of zero weights, and
+    ``informative`` the trajectories from which on each bound promises less than that. ``perception`` is the
+    data for the same error under noisy perception (:func:`.perception_needed`), if requested.
     """
 
     confidence: float
@@ -123,7 +122,7 @@ def _theorem(table: pd.DataFrame, epsilon: float, epsilon_s: float, features: in
 
 
 def summary(answer: Answer) -> dict[str, Any]:
-    """The answer as plain numbers and words, for JSON."""
+    """Return the answer as plain numbers and words, for JSON."""
     return {
         "confidence": answer.confidence,
         "violated": [a.name for a in answer.bound.violated],
@@ -139,7 +138,7 @@ def summary(answer: Answer) -> dict[str, Any]:
 
 
 def print_answer(answer: Answer, console: Console) -> None:
-    """The answer as two tables and, where the expert is known, what the error means for it."""
+    """Print the answer as two tables and, for a known expert, the meaning of the error."""
     from rich.table import Table
 
     bound = answer.bound
@@ -194,7 +193,7 @@ def _print_perception(needed: pd.DataFrame, console: Console) -> None:
     for row in needed.itertuples():
         draws = str(row.draws) if row.draws else "none"
         table.add_row(
-            names[row.Index], str(row.trajectories), draws, str(row.reports), f"{row.epsilon_o:.3g}"
+            names[row.Index], str(row.trajectories), draws, str(row.observations), f"{row.epsilon_o:.3g}"
         )
     console.print(table)
     console.print(

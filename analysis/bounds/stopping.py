@@ -1,11 +1,10 @@
-"""Stopping rules compared: how often they stop too soon, and how many sessions they save.
+"""Comparison of stopping rules: their false stops and the sessions that they save.
 
-A *false stop* is judged by what the learner has learned, never by the quantity that a rule looks at, so that
-all rules are judged alike: stopping a stream after session ``i`` is false if the learned behaviour's accuracy
-there is worse, by more than ``margin``, than what the same stream settles at, the mean accuracy of its last
-``tail`` sessions. (One last session would be a noisy yardstick, the best one a lucky one.) The accuracy is
-LBA, which needs the expert: it judges rules, and no rule sees it. A rule that never fires within the
-stream has made no false stop, and has saved nothing.
+The learned behaviour judges a *false stop*, never the quantity of a rule, so that all rules are judged alike:
+a stop after session ``i`` is false if the learned behaviour's accuracy there is worse, by more than
+``margin``, than the stream's mean accuracy of its last ``tail`` sessions. (One last session would be a noisy
+yardstick, the best one a lucky one.) The accuracy is LBA, which needs the expert: it judges rules, and is
+hidden from them. A rule that never fires within the stream makes no false stop and saves zero sessions.
 
 The rules themselves are those of :mod:`i2rl.inference.sessions.stopping`; here each is applied to all streams
 at once.
@@ -30,7 +29,7 @@ NEVER = 0
 
 
 class Histories(NamedTuple):
-    """What ``R`` streams of ``T`` sessions reported, and how good they were.
+    """Observations of ``R`` streams of ``T`` sessions, and their accuracy.
 
     Fields
     ------
@@ -90,11 +89,11 @@ def _first(fires: Bool[np.ndarray, "R n"], earliest: int) -> Int[np.ndarray, " R
 
 
 class Verdict(NamedTuple):
-    """A rule's stops over ``runs`` streams of ``sessions`` sessions.
+    """A rule's stops over ``replications`` streams of ``sessions`` sessions.
 
     Fields
     ------
-    false_stops, stops, runs : int
+    false_stops, stops, replications : int
     used : int ``[R]``
         Sessions each stream ran for: all where the rule never fired.
     sessions : int
@@ -104,7 +103,7 @@ class Verdict(NamedTuple):
 
     false_stops: int
     stops: int
-    runs: int
+    replications: int
     used: Int[np.ndarray, " R"]
     sessions: int
     loss: float
@@ -112,7 +111,7 @@ class Verdict(NamedTuple):
     @property
     def false_rate(self) -> float:
         """Share of all streams that were stopped too soon."""
-        return self.false_stops / self.runs
+        return self.false_stops / self.replications
 
     @property
     def saved(self) -> float:
@@ -121,7 +120,7 @@ class Verdict(NamedTuple):
 
     def interval(self, confidence: float = 0.95) -> tuple[float, float]:
         """Wilson interval of the false-stop rate."""
-        interval = binomtest(self.false_stops, self.runs).proportion_ci(confidence, "wilson")
+        interval = binomtest(self.false_stops, self.replications).proportion_ci(confidence, "wilson")
         return float(interval.low), float(interval.high)
 
 
@@ -133,10 +132,10 @@ def judge_stops(
     Raises ``ValueError`` for stops that do not fit the streams, a negative margin or a tail of no session.
     """
     stops, accuracy = np.asarray(stops), np.asarray(accuracy, float)
-    runs, sessions = accuracy.shape
-    if stops.shape != (runs,) or stops.min() < 0 or stops.max() > sessions:
+    replications, sessions = accuracy.shape
+    if stops.shape != (replications,) or stops.min() < 0 or stops.max() > sessions:
         raise ValueError(
-            f"stops must be {runs} sessions from 0 (never) to {sessions}, got shape {stops.shape} "
+            f"stops must be {replications} sessions from 0 (never) to {sessions}, got shape {stops.shape} "
             f"from {stops.min()} to {stops.max()}"
         )
     if margin < 0 or not 1 <= tail <= sessions:
@@ -146,10 +145,15 @@ def judge_stops(
     settled = accuracy[:, -tail:].mean(1)
     stopped = stops != NEVER
     used = np.where(stopped, stops, sessions)
-    missing = settled - accuracy[np.arange(runs), used - 1]
+    missing = settled - accuracy[np.arange(replications), used - 1]
     false = stopped & (missing > margin)
     return Verdict(
-        int(false.sum()), int(stopped.sum()), runs, used, sessions, float(missing[stopped].sum() / runs)
+        int(false.sum()),
+        int(stopped.sum()),
+        replications,
+        used,
+        sessions,
+        float(missing[stopped].sum() / replications),
     )
 
 
@@ -165,7 +169,7 @@ class Sweep(NamedTuple):
     verdicts: tuple[Verdict, ...]
 
     def at(self, rho: float) -> Verdict:
-        """The verdict at a tolerance of the sweep."""
+        """Return the verdict at a tolerance of the sweep."""
         match = np.flatnonzero(np.isclose(self.rho, rho))
         if not len(match):
             raise ValueError(f"{self.name} was not run at rho = {rho:g}")

@@ -1,9 +1,9 @@
-"""The dissertation's theorems: how much data is enough, and what has to be true for the answer to hold.
+"""The dissertation's theorems: sufficient amounts of data, and their assumptions.
 
-A theorem is a small function that returns a :class:`Bound`: an error, the confidence that it holds with,
-and the assumptions that it rests on (:mod:`~i2rl.analysis.bounds.assumptions`).
-:func:`~i2rl.analysis.bounds.assumptions.check` decides those that can be decided from an MDP, weights and a
-run, and :meth:`Bound.guarantee` refuses where one of them fails.
+A theorem is a small function that returns a :class:`Bound`: an error, the confidence that it holds with, and
+the assumptions that it rests on (:mod:`~i2rl.analysis.bounds.assumptions`).
+:func:`~i2rl.analysis.bounds.assumptions.check` checks those that an MDP, weights and a run settle, and
+:meth:`Bound.guarantee` raises if one of them fails.
 
 The dissertation numbers its results twice (chapters 4 and 6, and again in appendices B and E); both numbers
 are given; those of chapter 6.1, about noisy perception, are in :mod:`~i2rl.analysis.bounds.perception`.
@@ -12,13 +12,12 @@ error of one feature's discounted average ``(1 - gamma) phi_hat_k`` in [0, 1], s
 ``beta = epsilon / (1 - gamma)``. Log-likelihoods are those of the ``features`` statistic, ``sum_t gamma^t log
 pi(a_t | s_t)``, in nats per (infinitely long) trajectory.
 
-What the theorems say, read closely. The program's solution is at most ``beta |theta_E|_1`` nats worse than
-the expert's weights *on the data it was fitted to*, surely, with no probability involved. What holds with
-probability ``1 - delta`` is the statement about the expert's *expected* log-likelihood: it is at most
-``2 beta |theta_E|_1 <= 2 K epsilon / (1 - gamma)`` better than the solution's (Dudik et al. 2007, Theorem 1,
-which the proofs cite). Coverage is therefore measured on the expected gap; the sure one is
-:func:`sure_gap`. Expectations are over trajectories from ``p0``, or, where the program is given the starts
-that were seen (as the learners' is), over trajectories from those.
+The theorems in detail. The program's solution is at most ``beta |theta_E|_1`` nats worse than the expert's
+weights *on the data it was fitted to*, surely, with no probability involved. With probability ``1 - delta``,
+the expert's *expected* log-likelihood is at most ``2 beta |theta_E|_1 <= 2 K epsilon / (1 - gamma)`` better
+than the solution's (Dudik et al. 2007, Theorem 1, which the proofs cite). Coverage is therefore measured on
+the expected gap; the sure one is :func:`sure_gap`. Expectations are over trajectories from ``p0``, or over
+trajectories from the observed starts if the program is given those (as the learners' is).
 """
 
 from __future__ import annotations
@@ -81,7 +80,7 @@ def error_for(size: float, delta: float, events: float) -> float:
 
 
 def sure_gap(epsilon: float, n_features: int, discount: float, norm: float | None = None) -> float:
-    """What the program's solution surely loses on its own data: ``beta |theta_E|_1`` nats per trajectory.
+    """Bound the solution's gap on its own data, surely: ``beta |theta_E|_1`` nats per trajectory.
 
     ``norm`` is ``|theta_E|_1``; without it the ``K`` of weights in [0, 1]. Comes from optimality alone:
     ``LL(theta) - beta |theta|_1`` is largest at the solution.
@@ -228,9 +227,9 @@ def no_regret_sizes(c: float, sessions: int, delta: float, n_features: int, disc
 
 
 class Monotonicity(NamedTuple):
-    """Whether log-likelihoods rise from session to session, and the largest fall (nats per trajectory).
+    """Rise of log-likelihoods from session to session, and the largest fall (nats per trajectory).
 
-    ``premise`` is ``|Y_i| / |Y_{1:i-1}|`` at the last session, which the lemmas want to be small.
+    ``premise`` is ``|Y_i| / |Y_{1:i-1}|`` at the last session, which the lemmas require to be small.
     """
 
     rises: bool
@@ -243,10 +242,11 @@ def monotonicity(
     log_likelihoods: Float[np.ndarray, " T"],
     session_sizes: Int[np.ndarray, " T"] | Sequence[int] | None = None,
 ) -> Monotonicity:
-    """Lemmas 1 and 3 (Lemma 5 of appendix B, Lemma 7 of appendix E): likelihood rises with every session.
+    """Measure Lemmas 1 and 3 (Lemma 5 of appendix B, Lemma 7 of appendix E): the likelihood rises with every
+    session.
 
     The lemmas compare the fit to sessions ``1..i`` with the fit to ``1..i-1``: different data, whose
-    likelihood may fall merely because the new trajectories are less predictable. What is proved is the limit
+    likelihood may fall merely because the new trajectories are less predictable. The proofs show the limit
     (the change vanishes as the accumulated data outweigh a session's) and, within a session, that E- and
     M-steps never lower the likelihood. This function measures a run: ``falls`` are the sessions (from 1)
     whose log-likelihood is below the one before.
@@ -290,7 +290,7 @@ def observed_bound(
     *,
     predictable: bool = True,
 ) -> ObservedBound:
-    """A bound that is usually tighter than Theorem 1's: from the observed spread of each feature.
+    """Compute a bound from the observed spread of each feature, usually tighter than Theorem 1's.
 
     The union bound over features of an empirical Bernstein interval each; features that vary little get
     little slack, and the error is the sum of what each contributes, ``2 sum_k slack_k |theta_E,k|``, by the
@@ -361,14 +361,14 @@ def demonstrations_needed(
     epsilon_s: float = 0.05,
     deviations: Float[np.ndarray, " K"] | None = None,
 ) -> pd.DataFrame:
-    """How many trajectories are enough, by the theorem and by the tighter bounds.
+    """Compute how many trajectories are enough, by the theorem and by the tighter bounds.
 
-    Every row is for the same log-likelihood error, Theorem 2's ``4 K epsilon_l / (1 - gamma)`` nats, with
-    the same confidence; ``delta`` and ``delta_s`` share what is left of it equally. Rows differ in what they
-    use: ``theorem`` draws hidden steps and knows the features' range; ``exact completion`` does not
-    sample, so that ``epsilon_s`` and ``delta_s`` are spent on the trajectories; ``observed spread`` (a row
-    for each of some standard deviations of the discounted averages ``(1 - gamma) f_k``, or one for the
-    ``deviations [K]`` given) knows how much the features vary.
+    Every row is for the same log-likelihood error, Theorem 2's ``4 K epsilon_l / (1 - gamma)`` nats, with the
+    same confidence; ``delta`` and ``delta_s`` share the rest equally. Rows differ in their means: ``theorem``
+    draws hidden steps and uses the features' range; ``exact completion`` does not sample, so that
+    ``epsilon_s`` and ``delta_s`` are spent on the trajectories; ``observed spread`` (a row for each of some
+    standard deviations of the discounted averages ``(1 - gamma) f_k``, or one for the ``deviations [K]``
+    given) uses the features' variance.
 
     Returns a table with columns ``trajectories``, ``draws`` (of the hidden steps, in all) and
     ``error_nats``. Raises ``ValueError`` for a confidence outside (0, 1), errors that are not positive, or

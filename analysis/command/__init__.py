@@ -1,4 +1,4 @@
-"""The command line ``i2rl``.
+"""Command line ``i2rl``.
 
 Imports every room of the package.
 """

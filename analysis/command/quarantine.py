@@ -1,7 +1,7 @@
-"""Bad lines of a stream, set aside with their reasons so that learning may go on past them.
+"""Quarantine of a stream's bad lines, with their reasons, so that learning can continue.
 
-A line is in the file, and on the disk, before the journal's position moves past it. So a kill loses none. A
-line that is met again, because its session was never committed, is recognised by its digest.
+A line is on disk before the journal's position moves past it, so a kill loses none. A digest identifies a
+line that comes again because its session was never committed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class Line(NamedTuple):
     position : Position
         The input consumed once the line is.
     fault : str
-        Why it cannot be read; empty if it can.
+        Reason why the line is bad; empty for a good line.
     """
 
     text: str
@@ -50,7 +50,7 @@ class Quarantine:
     def __init__(self, path: str | os.PathLike[str]) -> None:
         """Open the file, making it if there is none.
 
-        Raises ``ValueError`` for a file with anything else in it, and ``OSError``.
+        Raises ``ValueError`` for a file with other content, and ``OSError``.
         """
         self.path = Path(path)
         self.added = 0
@@ -65,7 +65,7 @@ class Quarantine:
         return len(self._digests)
 
     def add(self, source: str, line: Line, reason: str) -> None:
-        """Set a line aside, on the disk when this returns; one that is there already stays there once."""
+        """Add a line, on disk on return; a line that is there already is added once."""
         digest = bytes.fromhex(line.position.digest)
         if digest in self._digests:
             return

@@ -76,17 +76,17 @@ def _followed(file: FileIO, path: str, say: Callable[[str], None], poll_seconds:
 
 
 def _is_rewritten(file: FileIO, tail: bytes) -> bool:
-    """Whether the file is shorter than what was read of it, or has other bytes there."""
+    """Test whether the file has other bytes, or fewer, where it was read."""
     return os.pread(file.fileno(), len(tail), file.tell() - len(tail)) != tail
 
 
 def read_lines(
     pieces: Iterable[bytes], source: str, limits: LineLimits = DEFAULT_LIMITS, *, skip: bool = False
 ) -> Iterator[Line]:
-    """Put lines together from pieces that end where lines do, if not before.
+    """Join pieces to lines; a piece ends at the end of a line or before it.
 
-    No more than ``limits.size`` of a line are kept; with ``skip`` a longer one comes out with a fault,
-    otherwise :class:`DemonstrationError` is raised as soon as it is too long.
+    A line has at most ``limits.size`` bytes; a longer one comes out with a fault with ``skip``, otherwise it
+    raises :class:`DemonstrationError`.
     """
     line = _Unfinished(Position())
     for piece in pieces:
@@ -144,16 +144,16 @@ def open_lines(
     skip: bool = False,
     say: Callable[[str], None] | None = None,
 ) -> tuple[Iterator[Line], str]:
-    """Lines of a file, or of standard input for ``-``, and the name to call it in messages.
+    """Open a file, or standard input for ``-``; return its lines and its name in messages.
 
-    ``say`` takes what there is to tell of a file that is followed; by default it goes to standard error.
-    Raises ``OSError``; the lines are as :func:`read_lines` gives them.
+    ``say`` receives messages about a followed file; the default prints to standard error. Raises ``OSError``;
+    the lines are as :func:`read_lines` gives them.
     """
     say = partial(print, file=sys.stderr) if say is None else say
     if path == "-":
         source = "standard input"
         if sys.stdin is None:
-            raise ValueError("standard input is closed: give a file with --demos")
+            raise ValueError("standard input is closed: give a file with --demonstrations")
         pieces = iter(partial(sys.stdin.buffer.readline, _PIECE), b"")
     else:
         source = os.path.basename(path)
@@ -172,7 +172,7 @@ def positioned(lines: Iterable[str | Line]) -> Iterator[Line]:
 
 
 def unread(lines: Iterable[Line], journal: Journal) -> Iterator[Line]:
-    """The lines that the journal has not learned from.
+    """Yield the lines that the journal has not learned from.
 
     Raises :class:`JournalError`, before the first of them, where the earlier lines are not those that were
     learned from.
@@ -236,7 +236,7 @@ def learn_stream(
         try:
             state, report = learner.update(state, demonstration)
         except ValueError as error:
-            # The learner counts trajectories within a session; a person looks for lines.
+            # The learner counts trajectories within a session; people count lines.
             numbers = [record.line for _, record in collected]
             place = f"line {numbers[0]}" if len(numbers) == 1 else f"session of lines {_listed(numbers)}"
             told = f"{source}, {place}: {error}"

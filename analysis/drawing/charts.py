@@ -24,16 +24,16 @@ from .text import counted, for_figure
 
 
 class LearningCurve(NamedTuple):
-    """One method's runs over the same sessions.
+    """One method's replications over the same sessions.
 
-    ``sessions [T]`` are session numbers, ``accuracy [seeds, T]`` LBA in [0, 1], ``log_likelihood
-    [seeds, T]`` nats per trajectory.
+    ``sessions [T]`` are session numbers, ``accuracy [replications, T]`` LBA in [0, 1], ``log_likelihood
+    [replications, T]`` nats per trajectory.
     """
 
     method: str
     sessions: Int[np.ndarray, " T"]
-    accuracy: Float[np.ndarray, "seeds T"]
-    log_likelihood: Float[np.ndarray, "seeds T"]
+    accuracy: Float[np.ndarray, "replications T"]
+    log_likelihood: Float[np.ndarray, "replications T"]
 
 
 def learning_curves(
@@ -45,7 +45,7 @@ def learning_curves(
     theme: Theme = LIGHT,
     title: str = "",
 ) -> Figure:
-    """Accuracy and log-likelihood against sessions: medians, and bands that hold ``coverage`` of the runs.
+    """Draw accuracy and log-likelihood against sessions: medians, and bands that hold ``coverage`` of them.
 
     ``expert_log_likelihood`` (nats per trajectory) draws the level of the true weights. ``x_scale`` is
     ``linear`` or ``log``. Raises ``ValueError`` for arrays that do not fit.
@@ -77,11 +77,11 @@ def learning_curves(
 
 
 class LearningTime(NamedTuple):
-    """One method's time: ``seconds [seeds, T]`` spent learning from the first ``trajectories [T]``."""
+    """One method's time: ``seconds [replications, T]`` spent learning from the first ``trajectories [T]``."""
 
     method: str
     trajectories: Int[np.ndarray, " T"]
-    seconds: Float[np.ndarray, "seeds T"]
+    seconds: Float[np.ndarray, "replications T"]
 
 
 def learning_time(
@@ -93,8 +93,8 @@ def learning_time(
 ) -> Figure:
     """Cumulative seconds of learning against trajectories seen, both on logarithmic scales.
 
-    Lines are medians, bands hold ``coverage`` of the runs. Raises ``ValueError`` for arrays that do not
-    fit and for times that are not positive.
+    Lines are medians, bands hold ``coverage`` of the replications. Raises ``ValueError`` for arrays that do
+    not fit and for times that are not positive.
     """
     figure = new_figure(theme, 7.0, 4.4)
     axes = figure.subplots()
@@ -114,12 +114,12 @@ def learning_time(
 
 
 class SuccessRate(NamedTuple):
-    """Counts of one method: ``successes`` and ``timeouts`` out of ``runs``."""
+    """Counts of one method: ``successes`` and ``timeouts`` out of ``replications``."""
 
     method: str
     successes: int
     timeouts: int
-    runs: int
+    replications: int
 
 
 def success_rates(
@@ -129,41 +129,47 @@ def success_rates(
     theme: Theme = LIGHT,
     title: str = "",
 ) -> Figure:
-    """Share of runs that reached the goal undetected, and that timed out, with Wilson intervals.
+    """Share of replications that reached the goal undetected, and that timed out, with Wilson intervals.
 
-    Raises ``ValueError`` for a method without runs or with more outcomes than runs.
+    Raises ``ValueError`` for a method without replications or with more outcomes than replications.
     """
     for rate in rates:
         if (
-            rate.runs < 1
+            rate.replications < 1
             or min(rate.successes, rate.timeouts) < 0
-            or rate.successes + rate.timeouts > rate.runs
+            or rate.successes + rate.timeouts > rate.replications
         ):
             raise ValueError(
-                f"{rate.method}: {rate.successes} successes and {rate.timeouts} time-outs of {rate.runs} runs"
+                f"{rate.method}: {rate.successes} successes and {rate.timeouts} time-outs "
+                f"of {rate.replications} replications"
             )
     figure = new_figure(theme, 8.6, 1.5 + 0.42 * len(rates))
     panels = figure.subplots(1, 2, sharey=True)
     figure.get_layout_engine().set(wspace=0.06)  # type: ignore[union-attr, call-arg]
     y = np.arange(len(rates))
-    runs = np.array([rate.runs for rate in rates])
+    replications = np.array([rate.replications for rate in rates])
     for panel, counts, name, color in (
         (panels[0], [rate.successes for rate in rates], "Reached the goal undetected", theme.series[0]),
         (panels[1], [rate.timeouts for rate in rates], "Timed out", theme.series[1]),
     ):
-        shares = np.array(counts) / runs
-        tests = [binomtest(count, n) for count, n in zip(counts, runs.tolist(), strict=True)]
+        shares = np.array(counts) / replications
+        tests = [binomtest(count, n) for count, n in zip(counts, replications.tolist(), strict=True)]
         low, high = np.transpose([test.proportion_ci(confidence, "wilson") for test in tests])
         panel.hlines(y, low, high, color=color, linewidth=2.2, alpha=0.65)
         panel.plot(shares, y, linestyle="none", marker="o", markersize=7, color=color)
         for at, share, top in zip(y, shares, high, strict=True):
             inside = top > 0.86
             panel.annotate(
-                f"{share:.0%}", (low[at] if inside else top, at), xytext=(-6 if inside else 6, 0),
-                textcoords="offset points", ha="right" if inside else "left", va="center", color=theme.ink,
+                f"{share:.0%}",
+                (low[at] if inside else top, at),
+                xytext=(-6 if inside else 6, 0),
+                textcoords="offset points",
+                ha="right" if inside else "left",
+                va="center",
+                color=theme.ink,
                 fontsize=TEXT - 0.5,
-            )  # fmt: skip
-        dress(panel, theme, title=name, x="share of runs", grid="x")
+            )
+        dress(panel, theme, title=name, x="share of replications", grid="x")
         panel.set_xlim(-0.02, 1.02)
         panel.set_xticks([0, 0.25, 0.5, 0.75, 1])
         panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
@@ -173,7 +179,7 @@ def success_rates(
     panels[1].tick_params(left=False)
     if title:
         head(figure, theme, [], title=title)
-    trials = _counts(set(runs.tolist()), "trial")
+    trials = _counts(set(replications.tolist()), "trial")
     foot(figure, theme, f"bar: {confidence:.0%} Wilson interval of {trials} a method")
     return figure
 
@@ -206,9 +212,15 @@ def weights_plot(
     axes.hlines(y, band.low, band.high, color=theme.series[0], linewidth=2.4, alpha=0.7)
     axes.plot(band.median, y, linestyle="none", marker="o", markersize=6.5, color=theme.series[0])
     axes.plot(
-        truth, y, linestyle="none", marker="D", markersize=8.5, markerfacecolor="none", markeredgewidth=1.8,
+        truth,
+        y,
+        linestyle="none",
+        marker="D",
+        markersize=8.5,
+        markerfacecolor="none",
+        markeredgewidth=1.8,
         color=theme.series[1],
-    )  # fmt: skip
+    )
     dress(axes, theme, x="weight (share of the L1 norm)", y="feature", grid="x")
     name_ticks(axes, "y", y, feature_names)
     axes.set_ylim(len(truth) - 0.4, -0.6)
@@ -232,23 +244,30 @@ def draw_band(
     style: Mapping[str, Any],
     method: str,
     x: Int[np.ndarray, " T"],
-    runs: Float[np.ndarray, "seeds T"],
+    replications: Float[np.ndarray, "replications T"],
     coverage: float,
 ) -> None:
-    """Draw a method's median over runs as a line in its style, and a band that holds ``coverage`` of them.
+    """Draw a method's median as a line in its style, and a band that holds ``coverage`` of the replications.
 
-    Raises ``ValueError`` for runs of another length than ``x``.
+    Raises ``ValueError`` for replications of another length than ``x``.
     """
-    x, runs = np.asarray(x), np.atleast_2d(runs)
-    if x.ndim != 1 or runs.shape[1:] != x.shape:
-        raise ValueError(f"{method}: runs of shape {runs.shape} do not fit {x.shape} points along the axis")
-    band = quantile_band(runs, coverage)
-    if len(runs) > 1:
+    x, replications = np.asarray(x), np.atleast_2d(replications)
+    if x.ndim != 1 or replications.shape[1:] != x.shape:
+        raise ValueError(
+            f"{method}: replications of shape {replications.shape} do not fit {x.shape} points along the axis"
+        )
+    band = quantile_band(replications, coverage)
+    if len(replications) > 1:
         axes.fill_between(x, band.low, band.high, color=style["color"], alpha=0.18, linewidth=0)
     axes.plot(
-        x, band.median, label=for_figure(method), linewidth=1.8, markersize=5,
-        markevery=max(len(x) // 8, 1), **style,
-    )  # fmt: skip
+        x,
+        band.median,
+        label=for_figure(method),
+        linewidth=1.8,
+        markersize=5,
+        markevery=max(len(x) // 8, 1),
+        **style,
+    )
 
 
 def set_scale(axes: Axes, which: str, scale: str) -> None:
@@ -270,11 +289,11 @@ def _direction(weights: Float[np.ndarray, "n K"]) -> Float[np.ndarray, "n K"]:
     return weights / norm
 
 
-def _of_runs(runs: set[int], coverage: float) -> str:
+def _of_runs(replications: set[int], coverage: float) -> str:
     """Small print of a figure of medians and bands."""
-    if runs == {1}:
-        return "line: one run"
-    return f"line: median; band: middle {coverage:.0%} of {_counts(runs, 'run')}"
+    if replications == {1}:
+        return "line: one replication"
+    return f"line: median; band: middle {coverage:.0%} of {_counts(replications, 'replication')}"
 
 
 def _counts(counts: set[int], noun: str) -> str:

@@ -63,7 +63,7 @@ class Estimates(NamedTuple):
         return Table([title or headings[0], *headings[1:]], rows, caption)
 
     def summary(self) -> list[dict[str, Any]]:
-        """The same as plain data; None where a weight is not determined."""
+        """Return the same as plain data; None for a weight that is not determined."""
         return [
             {
                 "feature": name,
@@ -78,7 +78,7 @@ class Estimates(NamedTuple):
 
 
 def laplace_errors(information: Float[np.ndarray, "K K"]) -> Float[np.ndarray, " K"]:
-    """Standard errors of the normal distribution with this information (its inverse covariance).
+    """Compute standard errors of the normal distribution with this information (its inverse covariance).
 
     Infinite for weights that a direction without positive information moves.
     """
@@ -86,7 +86,7 @@ def laplace_errors(information: Float[np.ndarray, "K K"]) -> Float[np.ndarray, "
     positive = values > 1e-12 * max(float(np.abs(values).max(initial=0.0)), 1e-300)
     variance = np.where(positive, 1 / np.where(positive, values, 1.0), np.inf)
     moved = axes**2 > 1e-16
-    # Nothing of an infinite variance is nothing.
+    # Zero times an infinite variance is zero.
     errors: np.ndarray = np.sqrt(np.sum(np.where(moved, axes**2, 0) * np.where(moved, variance, 0), axis=1))
     return errors
 

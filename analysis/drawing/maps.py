@@ -220,7 +220,7 @@ def _part(layout: Layout, s: int, i: int, n: int, down: int) -> tuple[np.ndarray
 def _panels(
     layout: Layout, frame: _Frame, theme: Theme, beside: float = 0.0
 ) -> tuple[Figure, list[Axes], Axes | None]:
-    """A figure with axes for each layer, and axes for a key ``beside`` them, so many inches wide."""
+    """Make a figure with axes for each layer, and axes for a key ``beside`` them, so many inches wide."""
     n = len(layout.layers)
     side = int(np.ceil(np.sqrt(n)))
     width, height = np.ptp(_ground(layout, frame), axis=0) + 2.4 * frame.radius
@@ -354,7 +354,7 @@ _BEND = [(0.15, -0.09), (0.24, -0.09), (0.30, -0.075), (0.335, -0.03), (0.34, 0.
 
 
 def _arrow(line: Sequence[tuple], head: Sequence[tuple]) -> Path:
-    """A line and a filled triangle at its end."""
+    """Make a line and a filled triangle at its end."""
     there_and_back = [*line, *reversed(line)]
     codes = [Path.MOVETO] + [Path.LINETO] * (len(there_and_back) - 1)
     triangle = [Path.MOVETO, Path.LINETO, Path.LINETO, Path.CLOSEPOLY]
@@ -391,7 +391,7 @@ def _placed(
 def _moves(
     mdp: TabularMDP, actions: Int[np.ndarray, " S"], layout: Layout
 ) -> tuple[Int[np.ndarray, " S"], Float[np.ndarray, " S"]]:
-    """What each state's action most probably does on the map, and in which direction, against the clock."""
+    """Find the likeliest effect of each state's action on the map, and its direction, against the clock."""
     s = np.arange(mdp.n_states)
     likeliest = np.asarray(mdp.probabilities)[s, actions].argmax(1)
     following = np.asarray(mdp.successors)[s, actions, likeliest]
@@ -452,7 +452,7 @@ def _draw_key(
     judged: bool,
     occluded: bool,
 ) -> None:
-    """What glyphs and fills mean, drawn with the map's own glyphs."""
+    """Draw the key of glyphs and fills with the map's own glyphs."""
     assert axes is not None
     facing = layout.heading is not None
     place = "cell" if layout.kind == "grid" else "place"
@@ -646,9 +646,13 @@ def _draw_strip(
         spine.set_visible(False)
     axes.legend(
         handles=[Patch(color=theme.goal, label="in view"), Patch(color=theme.cell, label="hidden")],
-        loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, frameon=False, fontsize=SMALL,
+        loc="lower right",
+        bbox_to_anchor=(1.0, 1.0),
+        ncols=2,
+        frameon=False,
+        fontsize=SMALL,
         labelcolor=theme.ink,
-    )  # fmt: skip
+    )
 
 
 def _strands(layout: Layout, visited: set[int]) -> tuple[list[tuple[int, ...]], str]:
@@ -704,7 +708,7 @@ def corridors(layout: Layout) -> list[tuple[int, ...]]:
 
 
 def _around(near: dict[int, set[int]]) -> list[int]:
-    """A closed loop from its smallest place, toward its smaller neighbour."""
+    """Order a closed loop from its smallest place, toward its smaller neighbour."""
     strand = [min(near)]
     while following := sorted(near[strand[-1]] - set(strand)):
         strand.append(following[0])

@@ -1,4 +1,4 @@
-"""What a study's ``results.json`` is made of: plain data, and how it came about."""
+"""Content of a study's ``results.json``: plain data and its provenance."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""How figures look: two themes, one colour-blind safe palette, the look of every method, and saving.
+"""Style of figures: two themes, one colour-blind safe palette, the style of every method, and saving.
 
 Every two of the eight colours of a theme are at least 0.1 apart in OKLab, also as seen without red, green or
 blue cones (Machado, Oliveira and Fernandes 2009); markers and dashes say the same once more.
@@ -34,7 +34,7 @@ class Theme(NamedTuple):
 
     ``surface`` is the page, ``ink`` text and lines, ``muted`` secondary text, ``grid`` rules. ``cell`` and
     ``view`` fill a floor map's cells, out of and in the learner's view; ``match`` and ``mismatch`` say
-    whether something agrees with the expert. ``series`` colours methods, told apart by marker and dashes
+    whether something agrees with the expert. ``series`` colours methods, which differ in marker and dashes
     too; ``heat`` runs from the page to the colour of certainty, ``signed`` from the negative over zero to the
     positive.
     """
@@ -66,19 +66,35 @@ class Theme(NamedTuple):
 
 
 LIGHT = Theme(
-    name="light", surface="#ffffff", ink="#1b1f24", muted="#57606a", grid="#d8dee4",
-    cell="#eceff2", view="#fff1bf", match="#0072b2", mismatch="#e8894a", goal="#00805d",
+    name="light",
+    surface="#ffffff",
+    ink="#1b1f24",
+    muted="#57606a",
+    grid="#d8dee4",
+    cell="#eceff2",
+    view="#fff1bf",
+    match="#0072b2",
+    mismatch="#e8894a",
+    goal="#00805d",
     series=("#153c7b", "#df6d15", "#0c736c", "#b279b0", "#835701", "#3a88fe", "#1b1f24", "#63310b"),
     heat=("#ffffff", "#cfe5f3", "#6fb1d8", "#0072b2", "#08304f"),
     signed=("#6b2c00", "#d2741f", "#e6e9ec", "#4f97cc", "#08304f"),
-)  # fmt: skip
+)
 DARK = Theme(
-    name="dark", surface="#0d1117", ink="#e6edf3", muted="#9aa5b1", grid="#30363d",
-    cell="#1d242d", view="#4a431f", match="#6cbcf0", mismatch="#b4531a", goal="#2fc99b",
+    name="dark",
+    surface="#0d1117",
+    ink="#e6edf3",
+    muted="#9aa5b1",
+    grid="#30363d",
+    cell="#1d242d",
+    view="#4a431f",
+    match="#6cbcf0",
+    mismatch="#b4531a",
+    goal="#2fc99b",
     series=("#708bfd", "#f76b10", "#82cda9", "#b17fa4", "#fecb2b", "#2164bd", "#e6edf3", "#ac4915"),
     heat=("#0d1117", "#11304a", "#17588a", "#2484c6", "#63b8f0"),
     signed=("#ffc08a", "#b9611a", "#262d36", "#2b78b8", "#9ad6ff"),
-)  # fmt: skip
+)
 THEMES = (LIGHT, DARK)
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X", "*")
@@ -97,7 +113,7 @@ DASHES: tuple[Any, ...] = (
 def series_style(theme: Theme, i: int) -> dict[str, Any]:
     """Colour, marker and dashes of the ``i``-th chain, bound or rule; repeats after eight.
 
-    Methods have a look of their own in every figure: see :func:`method_styles`.
+    Methods have their own style in every figure: see :func:`method_styles`.
     """
     return _look(theme, i, i, i)
 
@@ -119,35 +135,86 @@ class _Family(NamedTuple):
 
 
 _FAMILIES = (
-    _Family(0, 0, {
-        "LME-I2RL": 0, "LME-I2RL with random weights": 1, "batch LME": 2,
-        "batch LME, again after every session": 3, "random weights": 5, "true policy": 6,
-    }),
-    _Family(2, 0, {
-        "Jin et al., table over states": 4, "Jin et al., features": 3, "DARKO, goals": 7,
-        "DARKO, windows of 5": 5, "ME-I2RL, features": 2,
-    }),
-    _Family(0, 5, {
-        "MME-MTIRL": 0, "online MME-MTIRL": 1, "DPM-BIRL": 2, "EM-MLIRL": 3, "EM-MLIRL, not told": 4,
-    }),
-    _Family(0, 2, {
-        "RIMEO, no scores": 0, "RIMEO, scores averaged": 1, "RIMEO, scores stepwise": 2, "true sensor": 3,
-        "Robust IRL, batch": 4, "no noise": 5, "MLIRL, batch": 6, "RIFOM": 7,
-    }),
+    _Family(
+        0,
+        0,
+        {
+            "LME-I2RL": 0,
+            "LME-I2RL with random weights": 1,
+            "batch LME": 2,
+            "batch LME, again after every session": 3,
+            "random weights": 5,
+            "true policy": 6,
+        },
+    ),
+    _Family(
+        2,
+        0,
+        {
+            "Jin et al., table over states": 4,
+            "Jin et al., features": 3,
+            "DARKO, goals": 7,
+            "DARKO, windows of 5": 5,
+            "ME-I2RL, features": 2,
+        },
+    ),
+    _Family(
+        0,
+        5,
+        {
+            "MME-MTIRL": 0,
+            "online MME-MTIRL": 1,
+            "DPM-BIRL": 2,
+            "EM-MLIRL": 3,
+            "EM-MLIRL, number unknown": 4,
+        },
+    ),
+    _Family(
+        0,
+        2,
+        {
+            "RIMEO, no scores": 0,
+            "RIMEO, scores averaged": 1,
+            "RIMEO, scores stepwise": 2,
+            "true sensor": 3,
+            "Robust IRL, batch": 4,
+            "no noise": 5,
+            "MLIRL, batch": 6,
+            "RIFOM": 7,
+        },
+    ),
     _Family(4, 5, {"RIMEO, predicates alone": 3}),
     _Family(5, 2, {"oracle": 4, "observed": 5, "RIFOM, as coded": 3, "all, as printed": 1}),
     _Family(1, 0, {"hidden": 1, "hidden and noisy": 0}),
-    _Family(6, 2, {
-        "AIRL, clean input": 5, "AIRL, noisy input": 1, "robust-AIRL, noisy input": 3,
-        "SSRR + noisy-AIRL, noisy input": 2, "robust-AIRL, sensor learned": 4, "AIRL, noisy input, memory": 7,
-    }),
+    _Family(
+        6,
+        2,
+        {
+            "AIRL, clean input": 5,
+            "AIRL, noisy input": 1,
+            "robust-AIRL, noisy input": 3,
+            "SSRR + noisy-AIRL, noisy input": 2,
+            "robust-AIRL, sensor learned": 4,
+            "AIRL, noisy input, memory": 7,
+        },
+    ),
     _Family(1, 2, {"robust-AIRL": 3, "robust-AIRL, memory": 2}),
-    _Family(0, 1, {
-        "i2rl": 0, "i2rl, by level": 5, "uniform": 6, "frequencies": 4, "frequencies of choices": 7,
-        "given entry": 3, "level and entry": 2, "Markov": 1,
-    }),
+    _Family(
+        0,
+        1,
+        {
+            "i2rl": 0,
+            "i2rl, by level": 5,
+            "uniform": 6,
+            "frequencies": 4,
+            "frequencies of choices": 7,
+            "given entry": 3,
+            "level and entry": 2,
+            "Markov": 1,
+        },
+    ),
     _Family(0, 6, {"MaxEnt": 0, "BIRL": 1, "BIRL, only open moves are actions": 4}),
-)  # fmt: skip
+)
 METHOD_LOOKS = {
     name: (colour, (colour + family.dashes) % 8, (colour + family.markers) % 8)
     for family in _FAMILIES
@@ -156,7 +223,7 @@ METHOD_LOOKS = {
 """Palette by method: places of its colour in ``Theme.series``, of its dashes and of its marker."""
 _SAME = {
     "LME-I2RL, seen": "LME-I2RL",
-    "batch LME, one run": "batch LME",
+    "batch LME, once": "batch LME",
     "BIRL, blocked moves stay put": "BIRL",
 }
 
@@ -164,7 +231,8 @@ _SAME = {
 def method_styles(theme: Theme, names: Iterable[str]) -> dict[str, dict[str, Any]]:
     """Colour, marker and dashes of every method of a figure, by its name.
 
-    A method of this library looks the same in every figure. Others take what is left, in their order.
+    A method of this library has the same style in every figure. Others take the remaining styles, in their
+    order.
     """
     names = list(dict.fromkeys(names))
     looks = {
@@ -180,7 +248,7 @@ def method_styles(theme: Theme, names: Iterable[str]) -> dict[str, dict[str, Any
 
 
 def new_figure(theme: Theme, width: float, height: float) -> Figure:
-    """An empty figure of so many inches that arranges its axes without overlap."""
+    """Make an empty figure of so many inches that arranges its axes without overlap."""
     return Figure(figsize=(width, height), dpi=DPI, facecolor=theme.surface, layout="constrained")
 
 
@@ -227,10 +295,18 @@ def head(
         {"labels": [for_figure(handle.get_label()) for handle in handles]} if handles else {}
     )
     legend = figure.legend(
-        handles=list(handles), **named, title=for_figure(title) or None, loc="outside upper left",
-        ncols=columns, frameon=False, fontsize=TEXT, title_fontsize=TITLE + 0.5, alignment="left",
-        labelcolor=theme.ink, borderaxespad=0.3,
-    )  # fmt: skip
+        handles=list(handles),
+        **named,
+        title=for_figure(title) or None,
+        loc="outside upper left",
+        ncols=columns,
+        frameon=False,
+        fontsize=TEXT,
+        title_fontsize=TITLE + 0.5,
+        alignment="left",
+        labelcolor=theme.ink,
+        borderaxespad=0.3,
+    )
     legend.get_title().set_color(theme.ink)
 
 

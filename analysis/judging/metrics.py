@@ -1,4 +1,4 @@
-"""How good a learned reward is (section 7.2), and how sure the numbers are.
+"""Quality of a learned reward (section 7.2), and uncertainty of the numbers.
 
 A learned reward is judged by the behaviour it prescribes, under the expert's true reward: whether it acts
 like the expert, and what it loses. Everything is exact: no simulation, no offset, no rescaling.
@@ -32,8 +32,8 @@ from ...models.process.planning import (
 class Accuracy(NamedTuple):
     """Learned behaviour accuracy (LBA): a share in [0, 1] of all states, and of the choice states.
 
-    A *choice state* has more than one available action; elsewhere nothing can be done wrong. Where every
-    state is one (all patrol instances) the two shares are equal; where none is, ``choice`` is NaN.
+    A *choice state* has more than one available action; elsewhere no error is possible. If every state is one
+    (all patrol instances) the two shares are equal; without any, ``choice`` is NaN.
     """
 
     overall: Float[Array, ""]
@@ -48,7 +48,7 @@ class LearningError(NamedTuple):
 
 
 class Evaluation(NamedTuple):
-    """Everything a learned reward is judged by; ``value`` and ``best_value`` start from ``p0``."""
+    """All measures of a learned reward; ``value`` and ``best_value`` start from ``p0``."""
 
     accuracy: Accuracy
     error: LearningError
@@ -57,7 +57,8 @@ class Evaluation(NamedTuple):
 
 
 def greedy_policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """The deterministic policy that is optimal for ``weights``; ties go to the first action of the MDP.
+    """Compute the deterministic policy that is optimal for ``weights``; ties go to the first action of the
+    MDP.
 
     Actions within 1e-9 of the best, relative to the spread of the values, count as tied. Raises
     ``ValueError`` for discount 1, weights of the wrong number, or weights that are not numbers.
@@ -66,7 +67,7 @@ def greedy_policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, 
 
 
 def optimal_actions(mdp: TabularMDP, weights: Float[Array, " K"]) -> Bool[Array, "S A"]:
-    """Every action that is optimal for ``weights``; ties and errors as for :func:`greedy_policy`."""
+    """Find every action that is optimal for ``weights``; ties and errors as for :func:`greedy_policy`."""
     return _optimal(mdp, _checked(mdp, weights))
 
 
@@ -93,10 +94,11 @@ def policy_error(
 def learned_behavior_accuracy(
     mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
 ) -> Accuracy:
-    """LBA: share of states where the learned greedy action is one of the expert's optimal actions.
+    """Compute LBA: the share of states where the learned greedy action is one of the expert's optimal
+    actions.
 
-    The learner commits to one action per state, as in :func:`greedy_policy` (so a reward that says nothing
-    is not credited with every action); the expert's ties all count. Source: section 7.2. Errors as there.
+    The learner commits to one action per state, as in :func:`greedy_policy` (so a constant reward is not
+    credited with every action); the expert's ties all count. Source: section 7.2. Errors as there.
     """
     return evaluate(mdp, true_weights, learned_weights).accuracy
 
@@ -104,10 +106,9 @@ def learned_behavior_accuracy(
 def chance_accuracy(
     key: Array, mdp: TabularMDP, true_weights: Float[Array, " K"], draws: int = 200
 ) -> Float[np.ndarray, " draws"]:
-    """LBA of weights that nobody learned, drawn uniformly from ``[-0.99, 0.99]^K``.
+    """Compute LBA of random weights, uniform on ``[-0.99, 0.99]^K``.
 
-    An accuracy that many of them reach is no sign that anything was learned. Errors as for
-    :func:`greedy_policy`.
+    An accuracy that many of them reach does not prove learning. Errors as for :func:`greedy_policy`.
     """
     drawn = jax.random.uniform(key, (draws, mdp.n_features), float, -0.99, 0.99)
     return np.asarray(behaviour_accuracies(mdp, optimal_actions(mdp, true_weights), drawn))
@@ -141,14 +142,14 @@ def inverse_learning_error(
 def learned_value(
     mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
 ) -> Float[Array, ""]:
-    """Expected discounted true reward ``p0 . V^pi`` of the learned greedy policy."""
+    """Compute the expected discounted true reward ``p0 . V^pi`` of the learned greedy policy."""
     return evaluate(mdp, true_weights, learned_weights).value
 
 
 def evaluate(
     mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
 ) -> Evaluation:
-    """All of the above for the cost of one of them.
+    """Compute all measures above for the cost of one of them.
 
     Maps over learned weights ``[N, K]`` with ``jax.vmap(partial(evaluate, mdp, true_weights))``. Raises
     ``ValueError`` as :func:`greedy_policy` does.
@@ -235,24 +236,26 @@ def _log_likelihoods(
 
 
 class Band(NamedTuple):
-    """Median and quantiles of repeated runs."""
+    """Median and quantiles of replications."""
 
     low: Float[np.ndarray, " ..."]
     median: Float[np.ndarray, " ..."]
     high: Float[np.ndarray, " ..."]
 
 
-def quantile_band(runs: Float[np.ndarray, "seeds ..."], coverage: float = 0.5) -> Band:
+def quantile_band(replications: Float[np.ndarray, "replications ..."], coverage: float = 0.5) -> Band:
     """Median and central quantiles over the first axis; ``coverage`` 0.5 gives the quartiles.
 
-    The band says where the middle ``coverage`` of the runs lie; it is not a confidence interval of the
-    median. A NaN among the runs makes its column NaN rather than vanish. Raises ``ValueError`` without
-    runs or for a coverage outside (0, 1).
+    The band says where the middle ``coverage`` of the replications lie; it is not a confidence interval of
+    the median. A NaN among the replications makes its column NaN rather than vanish. Raises ``ValueError``
+    without replications or for a coverage outside (0, 1).
     """
-    runs = np.asarray(runs, float)
-    if runs.ndim < 1 or runs.shape[0] == 0:
-        raise ValueError(f"a band needs at least one run along the first axis, got shape {runs.shape}")
+    replications = np.asarray(replications, float)
+    if replications.ndim < 1 or replications.shape[0] == 0:
+        raise ValueError(
+            f"a band needs at least one run along the first axis, got shape {replications.shape}"
+        )
     if not 0 < coverage < 1:
         raise ValueError(f"coverage must lie in (0, 1), got {coverage}")
     tail = (1 - coverage) / 2
-    return Band(*np.quantile(runs, [tail, 0.5, 1 - tail], axis=0))
+    return Band(*np.quantile(replications, [tail, 0.5, 1 - tail], axis=0))

@@ -1,4 +1,4 @@
-"""How well several ways of doing a task were told apart, and what each is worth (section 7.2).
+"""Recovery of several behaviours from mixed demonstrations, and the value of each component (section 7.2).
 
 Ways found and behaviours demonstrated are numbered independently: agreement of the two is judged up to a
 renumbering, values under the true reward of what each trajectory really was.
@@ -70,7 +70,7 @@ def expected_value_difference(
     real = demonstration.lengths > 0
     if not real.any():
         raise ValueError("the value difference of no trajectories is not defined")
-    # Padded, so that learners which find more ways or fewer share a compiled program.
+    # Padded, so that learners with more components or fewer share a compiled program.
     room = 1 << (len(found) - 1).bit_length()
     padded = np.concatenate([found, np.broadcast_to(found[:1], (room - len(found), mdp.n_features))])
     loss = np.asarray(_losses(mdp, jnp.asarray(truth), jnp.asarray(padded)))
@@ -107,7 +107,7 @@ def assignment_accuracy(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarr
 
 
 def match_components(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> dict[int, int]:
-    """Which way is which behaviour: from behaviours to ways, one to one, with most trajectories in common.
+    """Match behaviours to components, one to one, with the most trajectories in common.
 
     A behaviour is missing where no way is left for it that has any of its trajectories. Errors as for
     :func:`assignment_accuracy`.
@@ -118,11 +118,11 @@ def match_components(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray,
 
 
 def adjusted_rand_index(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> float:
-    """Agreement of two partitions over pairs of trajectories, 0 by chance and 1 when equal.
+    """Compute the agreement of two partitions over pairs of trajectories, 0 by chance and 1 when equal.
 
     ``(together - chance) / (most - chance)``: pairs together in both, their expectation under random
-    partitions with the same cluster sizes, and the mean of the pairs together in either (Hubert and Arabie
-    1985). Two partitions that both put all together, or all apart, agree: 1. Errors as for
+    partitions with the same sizes, and the mean of the pairs together in either (Hubert and Arabie 1985). Two
+    partitions that both join all trajectories, or separate all, agree: 1. Errors as for
     :func:`assignment_accuracy`.
     """
     table, _, _ = _contingency(labels, assignments)

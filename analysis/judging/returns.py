@@ -1,7 +1,7 @@
-"""How good a reward and a policy of networks are (section 7.4.3): returns, correlations, LBA, empirical ILE.
+"""Quality of a reward and a policy of networks (section 7.4.3): returns, correlations, LBA, empirical ILE.
 
-Where there is no table of states everything is estimated from episodes, so every number comes with the
-distribution it was taken over, its count and an interval. Shares are in [0, 1].
+Without a table of states all measures are estimated from episodes, so every number comes with its
+distribution, its count and an interval. Shares are in [0, 1].
 """
 
 from __future__ import annotations
@@ -31,10 +31,10 @@ def returns_at_fixed_length(
     *,
     deterministic: bool = False,
 ) -> Float[np.ndarray, " episodes"]:
-    """Undiscounted returns, by the environment's own reward, of episodes of ``length`` steps.
+    """Simulate undiscounted returns, by the environment's own reward, of episodes of ``length`` steps.
 
-    An episode that terminates earns nothing more; where the length is not to depend on the policy (Table
-    7.3), the environment must not terminate: ``locomotion(name, terminate_when_unhealthy=False)``.
+    An episode earns zero after it terminates; to make the length independent of the policy (Table 7.3), use
+    an environment that does not terminate: ``locomotion(name, terminate_when_unhealthy=False)``.
     """
     return simulate(environment, policy, key, episodes, length, deterministic=deterministic).returns
 
@@ -50,7 +50,7 @@ class Interval(NamedTuple):
 
 
 class Correlation(NamedTuple):
-    """How two numbers go together.
+    """Correlation of two numbers.
 
     Fields
     ------
@@ -175,7 +175,7 @@ def _standardised(x: Float[np.ndarray, " N"]) -> Float[np.ndarray, " N"]:
 
 
 def _resampled(key: Array, n: int, resamples: int) -> Int[np.ndarray, "resamples n"]:
-    """How often each of ``n`` is drawn, with replacement."""
+    """Draw the multiplicities of ``n`` items, with replacement."""
     drawn = np.asarray(jax.random.randint(key, (resamples, n), 0, n))
     return np.bincount((drawn + n * np.arange(resamples)[:, None]).ravel(), minlength=resamples * n).reshape(
         resamples, n
@@ -194,7 +194,8 @@ def _percentiles(drawn: Float[np.ndarray, " B"], coverage: float) -> Interval:
 
 
 def action_agreement(space: ActionSpace, expert: np.ndarray, learner: np.ndarray) -> Float[np.ndarray, "..."]:
-    """How alike two actions are, in [0, 1]: ``1 - |a_E - a_L| / |a_max - a_min|``, or whether they are equal.
+    """Compute the agreement of two actions, in [0, 1]: ``1 - |a_E - a_L| / |a_max - a_min|``, or their
+    equality.
 
     Vectors ``[..., k]`` are cut to their bounds first, as an environment does.
     """
@@ -210,16 +211,17 @@ def action_agreement(space: ActionSpace, expert: np.ndarray, learner: np.ndarray
 def behaviour_accuracy(
     space: ActionSpace, expert: Behaviour, learner: Behaviour, observations: Float[np.ndarray, "N d"]
 ) -> float:
-    """LBA (section 7.4.3): mean agreement of both policies' deterministic actions in the given states.
+    """Compute LBA (section 7.4.3): mean agreement of both policies' deterministic actions in the given
+    states.
 
-    The dissertation's is 100 times this. No offset, no sampled actions; the states are the caller's to state.
+    The dissertation's is 100 times this. Actions are exact modes; the caller chooses the states.
     """
     seen = jnp.asarray(observations, jnp.float32)
     ours, theirs = (np.asarray(acted(p, _NO_KEY, seen, True)) for p in (learner, expert))
     return float(action_agreement(space, theirs, ours).mean())
 
 
-# The mode draws nothing.
+# The mode needs no draw.
 _NO_KEY = jnp.zeros(2, jnp.uint32)
 
 
@@ -305,7 +307,7 @@ class EmpiricalILE(NamedTuple):
 
 
 def empirical_ile(demonstrated: float, generated: float) -> EmpiricalILE:
-    """Both forms, from two values. NaN where what is divided by is zero."""
+    """Compute both forms from two values. NaN where the divisor is zero."""
     apart = demonstrated - generated
     return EmpiricalILE(
         demonstrated,
@@ -353,8 +355,8 @@ class Recovery(NamedTuple):
 
     Fields
     ------
-    share : float, ``(robust - noisy) / (clean - noisy)`` of the means over seeds
-    low, high : float, its interval; infinite ends where too few seeds show a loss at all
+    share : float, ``(robust - noisy) / (clean - noisy)`` of the means over replications
+    low, high : float, its interval; infinite ends where too few replications show a loss at all
     lost : float, share of resamples in which noise cost something
     n : int, seeds
     """
@@ -375,20 +377,21 @@ def recovered_share(
     coverage: float = 0.95,
     resamples: int = 10_000,
 ) -> Recovery:
-    """What of the return (or LBA) lost to noise a robust learner recovers, with a bootstrap over seeds.
+    """Estimate the share of the return (or LBA) lost to noise that a robust learner recovers.
 
-    Entry ``i`` of all three is of the same seed, and seeds are drawn together. Where noise may have cost
-    nothing, the ratio has a pole: means without a loss, of the seeds or of a resample, count as minus or plus
-    infinity by what the robust learner gained. Of a few seeds a bootstrap's interval is too narrow. Raises
-    ``ValueError`` for different numbers of seeds, none, or numbers that are not finite.
+    A bootstrap over replications gives the interval: entry ``i`` of all three has one seed, and the three are
+    drawn together. If noise may have no cost, the ratio has a pole: means without a loss, of the replications
+    or of a resample, count as minus or plus infinity by what the robust learner gained. Of a few replications
+    a bootstrap's interval is too narrow. Raises ``ValueError`` for different numbers of replications, none,
+    or numbers that are not finite.
     """
-    runs = [np.asarray(x, float) for x in (clean, noisy, robust)]
-    n = len(runs[0])
-    if n == 0 or any(x.shape != (n,) for x in runs):
+    replications = [np.asarray(x, float) for x in (clean, noisy, robust)]
+    n = len(replications[0])
+    if n == 0 or any(x.shape != (n,) for x in replications):
         raise ValueError(
-            f"clean, noisy and robust need one number a seed, got shapes {[x.shape for x in runs]}"
+            f"clean, noisy and robust need one number a seed, got shapes {[x.shape for x in replications]}"
         )
-    for name, values in zip(("clean", "noisy", "robust"), runs, strict=True):
+    for name, values in zip(("clean", "noisy", "robust"), replications, strict=True):
         if not np.isfinite(values).all():
             raise ValueError(f"seed {int(np.argmin(np.isfinite(values)))} of {name} is not finite")
 
@@ -396,7 +399,7 @@ def recovered_share(
         with np.errstate(divide="ignore", invalid="ignore"):
             return np.where(lost > 0, gained / lost, np.copysign(np.inf, gained))
 
-    cost, won = runs[0] - runs[1], runs[2] - runs[1]
+    cost, won = replications[0] - replications[1], replications[2] - replications[1]
     weights = np.asarray(_resampled(key, n, resamples), float) / n
     lost, share = weights @ cost, ratio(cost.mean(), won.mean())
     drawn = ratio(lost, weights @ won)
@@ -407,18 +410,20 @@ def recovered_share(
 
 
 class SeedInterval(NamedTuple):
-    """A mean over seeds and its interval."""
+    """A mean over replications and its interval."""
 
     mean: Float[np.ndarray, "..."]
     low: Float[np.ndarray, "..."]
     high: Float[np.ndarray, "..."]
 
 
-def seed_interval(runs: Float[np.ndarray, "seeds ..."], coverage: float = 0.95) -> SeedInterval:
-    """Mean over the first axis with Student's interval, which a handful of seeds need; NaN ends for one."""
-    runs = np.asarray(runs, float)
-    n, mean = len(runs), runs.mean(0)
+def seed_interval(
+    replications: Float[np.ndarray, "replications ..."], coverage: float = 0.95
+) -> SeedInterval:
+    """Compute the mean over the first axis with Student's interval; its ends are NaN for one replication."""
+    replications = np.asarray(replications, float)
+    n, mean = len(replications), replications.mean(0)
     if n < 2:
         return SeedInterval(mean, np.full_like(mean, np.nan), np.full_like(mean, np.nan))
-    half = stats.t.ppf(0.5 + coverage / 2, n - 1) * runs.std(0, ddof=1) / math.sqrt(n)
+    half = stats.t.ppf(0.5 + coverage / 2, n - 1) * replications.std(0, ddof=1) / math.sqrt(n)
     return SeedInterval(mean, mean - half, mean + half)

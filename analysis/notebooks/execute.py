@@ -1,8 +1,8 @@
-"""Execute the notebooks from a clean start, and save them without what only this machine and moment know.
+"""Execute the notebooks from a clean start, and save them without machine and time.
 
 ``python -m i2rl.analysis.notebooks.execute`` executes all of them in place, at the sizes they are published
 with; paths as arguments choose some. The cell tagged ``parameters`` (papermill's convention) holds a
-notebook's sizes: whoever executes one may set others, as the tests do, and they are injected after it.
+notebook's sizes: an execution may set others, as the tests do; they are injected after it.
 """
 
 from __future__ import annotations
@@ -35,14 +35,15 @@ _METADATA = {
 
 
 def notebooks() -> list[Path]:
-    """The package's notebooks in the order in which they are to be read."""
+    """List the package's notebooks in reading order."""
     return sorted(FOLDER.glob("*.ipynb"))
 
 
 def execute_notebook(
     path: Path | str, parameters: Mapping[str, Any] | None = None, *, timeout: int = 600
 ) -> NotebookNode:
-    """The notebook with its outputs, executed by this interpreter in an empty folder; no file is written.
+    """Execute the notebook by this interpreter in an empty folder, and return it with its outputs; write no
+    file.
 
     ``parameters`` replace values set in the cell tagged ``parameters``; ``timeout`` is in seconds, of one
     cell. The user's Jupyter and IPython settings play no part. Raises ``ValueError`` for a parameter that
@@ -56,15 +57,19 @@ def execute_notebook(
             kernel_name="python3",
             kernel_spec_manager=KernelSpecManager(kernel_dirs=[]),
             connection_file=os.path.join(folder, "connection.json"),
-            # A socket in a private folder: nobody else can listen, which the kernel would warn of.
+            # A socket in a private folder: other users cannot listen, which the kernel would warn of.
             transport="tcp" if sys.platform == "win32" else "ipc",
         )
         work = Path(folder, "work")
         work.mkdir()
         client = NotebookClient(
-            notebook, km=manager, timeout=timeout, record_timing=False, coalesce_streams=True,
+            notebook,
+            km=manager,
+            timeout=timeout,
+            record_timing=False,
+            coalesce_streams=True,
             resources={"metadata": {"path": str(work)}},
-        )  # fmt: skip
+        )
         environment = os.environ | {
             "IPYTHONDIR": os.path.join(folder, "ipython"),
             "COLUMNS": "100",
@@ -108,7 +113,9 @@ def _inject(notebook: NotebookNode, parameters: Mapping[str, Any], name: str) ->
 
 
 def tidy(notebook: NotebookNode) -> NotebookNode:
-    """The notebook without machine metadata, and with pictures of at most 256 colours (a third the size)."""
+    """Return the notebook without machine metadata, and with pictures of at most 256 colours (a third the
+    size).
+    """
     notebook.metadata = nbformat.from_dict(_METADATA)
     for cell in notebook.cells:
         cell.metadata = nbformat.from_dict({k: v for k, v in cell.metadata.items() if k == "tags"})

@@ -49,7 +49,7 @@ def require_posterior(
     *,
     extra: tuple[str, ...] = (),
 ) -> xr.DataArray:
-    """The weights ``(chain, draw, ..., feature)`` of a posterior, if it is one, and one of this model.
+    """Return the weights ``(chain, draw, ..., feature)``; raise unless they are a posterior of this model.
 
     ``extra`` names the dimensions that weights must have besides ``chain``, ``draw`` and ``feature``. An MDP
     or sensor is compared by the fingerprints that :func:`~i2rl.inference.posteriors.weights.sample_posterior`
@@ -190,8 +190,12 @@ def posterior_by_session(
     DemonstrationError, ValueError
         As there, and ``ValueError`` for sessions that do not exist or do not increase.
     """
-    for name, number, least in (("draws", draws, 1), ("chains", chains, 1), ("warmup", warmup, 0),
-                                ("trajectories", trajectories, 1)):  # fmt: skip
+    for name, number, least in (
+        ("draws", draws, 1),
+        ("chains", chains, 1),
+        ("warmup", warmup, 0),
+        ("trajectories", trajectories, 1),
+    ):
         if number < least:
             raise ValueError(f"{name} must be at least {least}, got {number}")
     key, demonstration = as_key(key), checked_demonstration(mdp, demonstration)
@@ -219,10 +223,14 @@ def posterior_by_session(
         lambda x: np.moveaxis(x.reshape(len(numbers), chains, *x.shape[1:]), 0, 2), in_threads(run, jobs)
     )
     configuration = {
-        "draws": draws, "warmup": warmup, "chains": chains, "target_accept": target_accept,
-        "max_tree_depth": max_tree_depth, "trajectories": trajectories,
+        "draws": draws,
+        "warmup": warmup,
+        "chains": chains,
+        "target_accept": target_accept,
+        "max_tree_depth": max_tree_depth,
+        "trajectories": trajectories,
         "key": np.asarray(jax.random.key_data(key)),
-    }  # fmt: skip
+    }
     attrs = {
         **provenance(mdp, "NUTS over weights, hidden steps summed out", configuration),
         "inference_library": "numpyro",
@@ -248,7 +256,7 @@ def posterior_by_session(
 
 
 def _restricted(problem: Problem, rows: np.ndarray) -> Problem:
-    """The problem of some of the trajectories, by their rows, in arrays of the same shape."""
+    """Restrict the problem to some trajectories, by their rows, in arrays of the same shape."""
     repeats = np.bincount(rows, minlength=len(problem.repeats))
     absent = (repeats == 0)[:, None, None]
     # A row of padding has probability one, whatever the weights.

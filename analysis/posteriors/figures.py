@@ -79,9 +79,17 @@ def weights_by_session(
             ends = low.isel(feature=k), high.isel(feature=k)
             axes.vlines(sessions, *ends, color=color, linewidth=linewidth, zorder=4)
         axes.plot(
-            sessions, median.isel(feature=k), color=color, linewidth=0.9, linestyle=(0, (2, 2)), marker="o",
-            markersize=6.5, markerfacecolor=theme.surface, markeredgewidth=1.7, zorder=5,
-        )  # fmt: skip
+            sessions,
+            median.isel(feature=k),
+            color=color,
+            linewidth=0.9,
+            linestyle=(0, (2, 2)),
+            marker="o",
+            markersize=6.5,
+            markerfacecolor=theme.surface,
+            markeredgewidth=1.7,
+            zorder=5,
+        )
         if true_weights is not None:
             axes.axhline(true_weights[k], color=other, linewidth=1.6, linestyle=(0, (6, 2)), zorder=2)
         dress(axes, theme, title=name)
@@ -104,7 +112,7 @@ def weights_by_session(
 def forest_plot(
     idata: az.InferenceData, *, coverage: float = 0.9, theme: Theme = LIGHT, title: str = ""
 ) -> Figure:
-    """Each weight: all draws together, and below them every chain on its own, which should look alike.
+    """Draw each weight: all draws together, and below them every chain on its own; chains should agree.
 
     Points are medians, thick bars hold the middle half of the draws, thin ones the middle ``coverage``.
     """
@@ -165,9 +173,16 @@ def trace_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: str = ""
         if diverging is not None and diverging.any():
             at = diverging.any("chain").values
             right.plot(
-                values["draw"].values[at], np.zeros(at.sum()), linestyle="none", marker="|", markersize=9,
-                markeredgewidth=1.6, color=theme.ink, transform=right.get_xaxis_transform(), clip_on=False,
-            )  # fmt: skip
+                values["draw"].values[at],
+                np.zeros(at.sum()),
+                linestyle="none",
+                marker="|",
+                markersize=9,
+                markeredgewidth=1.6,
+                color=theme.ink,
+                transform=right.get_xaxis_transform(),
+                clip_on=False,
+            )
     grid[-1, 0].set_xlabel(_WEIGHT, color=theme.ink, fontsize=TEXT)
     grid[-1, 1].set_xlabel("draw", color=theme.ink, fontsize=TEXT)
     figure.supylabel(
@@ -176,9 +191,17 @@ def trace_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: str = ""
     handles: list[Any] = _chain_handles(theme, chains, lines=True)
     if diverging is not None and diverging.any():
         handles.append(
-            Line2D([], [], linestyle="none", marker="|", markersize=9, markeredgewidth=1.6, color=theme.ink,
-                   label=f"divergent draw ({int(diverging.sum())})")
-        )  # fmt: skip
+            Line2D(
+                [],
+                [],
+                linestyle="none",
+                marker="|",
+                markersize=9,
+                markeredgewidth=1.6,
+                color=theme.ink,
+                label=f"divergent draw ({int(diverging.sum())})",
+            )
+        )
     head(figure, theme, handles, title=title, columns=5)
     return figure
 
@@ -203,7 +226,7 @@ def rank_plot(idata: az.InferenceData, *, bins: int = 20, theme: Theme = LIGHT, 
         ranks = stats.rankdata(weights.isel(feature=k).values).reshape(chains, draws)
         axes.axhspan(low, high, color=theme.cell, linewidth=0)
         axes.axhline(draws / bins, color=theme.muted, linewidth=0.9)
-        # Twice the expected count at least, so that a panel in which all is well looks so.
+        # Twice the expected count at least, so that a panel of a good fit is flat.
         highest = 2 * draws / bins
         for c in range(chains):
             style = series_style(theme, c)
@@ -255,9 +278,16 @@ def convergence_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: st
     for axes in (left, right):
         for row in y[frozen]:
             axes.text(
-                0.5, row, "stuck: every draw is the same", transform=axes.get_yaxis_transform(), ha="center",
-                va="center", color=theme.ink, fontsize=SMALL, fontweight="bold",
-            )  # fmt: skip
+                0.5,
+                row,
+                "stuck: every draw is the same",
+                transform=axes.get_yaxis_transform(),
+                ha="center",
+                va="center",
+                color=theme.ink,
+                fontsize=SMALL,
+                fontweight="bold",
+            )
     for name, style in (("ess_bulk", blue), ("ess_tail", orange)):
         right.plot(table[name], y, marker=style["marker"], color=style["color"], **dots)
     limit = _ESS_PER_CHAIN * chains
@@ -312,10 +342,14 @@ def completed_path(
 def completion_frequencies(
     idata: az.InferenceData, trajectories: Sequence[int], mdp: TabularMDP
 ) -> tuple[Float[np.ndarray, "L S"], np.ndarray]:
-    """How often each state completes each step, and whether the step was seen; rows joined one by one."""
+    """Compute how often each state completes each step, and whether the step was seen; rows joined one by
+    one.
+    """
     require_posterior(idata, mdp)
-    for group, made in (("completions", "sample_posterior(..., completions=True)"),
-                        ("observed_data", "sample_posterior")):  # fmt: skip
+    for group, made in (
+        ("completions", "sample_posterior(..., completions=True)"),
+        ("observed_data", "sample_posterior"),
+    ):
         if group not in idata.groups():
             raise InferenceDataError(f"the InferenceData has no group {group!r}, which {made} makes")
     n = idata["completions"].sizes["trajectory"]
@@ -351,26 +385,47 @@ def predictive_plot(
     axes.plot(x, mean, linestyle="none", marker="_", markersize=7, markeredgewidth=1.8, color=theme.series[0])
     within: dict[str, Any] = {"linestyle": "none", "marker": "o", "markersize": 4.5, "color": theme.ink}
     beyond: dict[str, Any] = {
-        "linestyle": "none", "marker": "D", "markersize": 5.5, "color": theme.series[1],
-    }  # fmt: skip
+        "linestyle": "none",
+        "marker": "D",
+        "markersize": 5.5,
+        "color": theme.series[1],
+    }
     axes.plot(x[inside], observed[inside], **within)
     axes.plot(x[~inside], observed[~inside], **beyond)
     dress(axes, theme, x="state, by expected visits", y="steps seen", grid="y")
     name_ticks(
-        axes, "x", x, shown["visited_state"].values, rotation=90,
+        axes,
+        "x",
+        x,
+        shown["visited_state"].values,
+        rotation=90,
         fontsize=SMALL - 1 if len(x) > 40 else SMALL,
-    )  # fmt: skip
+    )
     axes.set_xlim(-0.8, len(x) - 0.2)
     axes.set_ylim(bottom=-0.04 * max(high.max(initial=1), observed.max(initial=1)))
     axes.yaxis.set_major_locator(MaxNLocator(6, integer=True))
     handles = [
-        Line2D([], [], color=theme.series[0], linewidth=3.2, alpha=0.45,
-               label=f"predicted, middle {coverage:.0%}"),
-        Line2D([], [], color=theme.series[0], linestyle="none", marker="_", markersize=7, markeredgewidth=1.8,
-               label="predicted mean"),
+        Line2D(
+            [],
+            [],
+            color=theme.series[0],
+            linewidth=3.2,
+            alpha=0.45,
+            label=f"predicted, middle {coverage:.0%}",
+        ),
+        Line2D(
+            [],
+            [],
+            color=theme.series[0],
+            linestyle="none",
+            marker="_",
+            markersize=7,
+            markeredgewidth=1.8,
+            label="predicted mean",
+        ),
         Line2D([], [], **within, label=f"seen, inside ({inside.sum()})"),
         Line2D([], [], **beyond, label=f"seen, outside ({(~inside).sum()})"),
-    ]  # fmt: skip
+    ]
     head(figure, theme, handles, title=title, columns=4)
     left_out = check.sizes["visited_state"] - len(order)
     p = float(check["discrepancy_p_value"])

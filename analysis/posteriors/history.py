@@ -67,36 +67,36 @@ def run_history(
     seed: int | None = None,
     true_weights: Float[np.ndarray, " K"] | None = None,
 ) -> az.InferenceData:
-    """A learner's sessions as ``InferenceData``.
+    """Convert a learner's sessions to ``InferenceData``.
 
     Parameters
     ----------
     learner : Learner
-    run : Run or sequence of Report
-        What :func:`~i2rl.inference.sessions.running.run_sessions` returned, or the reports alone.
+    run : Run or sequence of SessionInfo
+        Result of :func:`~i2rl.inference.sessions.running.run_sessions`, or its infos alone.
     statistic : NamedTuple of arrays, optional
-        The sufficient statistic at the end; taken from the run's state where there is one.
+        The sufficient statistic at the end; by default that of the run's state.
     seed : int, optional
-        Kept as an attribute.
+        Stored as an attribute.
     true_weights : float ``[K]``, optional
-        The expert's weights, where they are known.
+        The expert's weights, if known.
 
     Returns
     -------
     arviz.InferenceData
         ``sessions``: ``weights (session, feature)``; ``log_likelihood``, ``demonstration_log_likelihood``,
         ``gradient``, ``iterations``, ``solver_iterations`` and ``seconds (session)``, see
-        :class:`~i2rl.inference.sessions.learner.SessionInfo`. Infos with further fields give more.
-        ``learned``, what the learner ended with: ``soft_policy (state, action)``, ``weights (feature)`` and
-        the statistic's fields (``counts (state, action)`` or ``features (feature)`` and ``start (state)``,
-        and ``size``).
-        ``constant_data``, if the true weights are known: ``true_weights (feature)``.
-        Attributes, of the whole and of every group: see :func:`provenance`, and the learner's ``signature``.
+        :class:`~i2rl.inference.sessions.learner.SessionInfo`. Infos with further fields give further
+        variables. ``learned``, the learner's last estimates: ``soft_policy (state, action)``, ``weights
+        (feature)`` and the statistic's fields (``counts (state, action)`` or ``features (feature)`` and
+        ``start (state)``, and ``size``). ``constant_data``, if the true weights are known: ``true_weights
+        (feature)``. Attributes, of the whole and of every group: see :func:`provenance`, and the learner's
+        ``signature``.
 
     Raises
     ------
     ValueError
-        For no reports, for reports of a fleet, and for weights that do not fit the learner's MDP.
+        For no infos, for infos of a fleet, and for weights that do not fit the learner's MDP.
     """
     infos, statistic = _infos(run), _statistic_of(run) if statistic is None else statistic
     if np.ndim(infos[0].session) > 0:
@@ -112,10 +112,11 @@ def fleet_history(
     seed: int | None = None,
     true_weights: Float[np.ndarray, " K"] | None = None,
 ) -> az.InferenceData:
-    """The sessions of a fleet: as :func:`run_history`, with a leading dimension ``run``, one entry a stream.
+    """Convert the sessions of a fleet as :func:`run_history` does, with a leading dimension ``run``, one
+    entry a stream.
 
-    ``infos`` are those of consecutive updates of :func:`~i2rl.inference.sessions.fleets.fleet`, ``state``
-    is the fleet's last state. Raises ``ValueError`` as there, and for reports of a single learner.
+    ``infos`` are those of consecutive updates of :func:`~i2rl.inference.sessions.fleets.fleet`, ``state`` is
+    the fleet's last state. Raises ``ValueError`` as there, and for infos of a single learner.
     """
     infos = _infos(infos)
     if np.ndim(infos[0].session) != 1:
@@ -124,7 +125,7 @@ def fleet_history(
 
 
 def _infos(run: Run | Sequence[SessionInfo]) -> Sequence[SessionInfo]:
-    # A report is itself a tuple: of numbers, none of which is a report.
+    # An info is itself a tuple of numbers.
     infos = run.infos if isinstance(run, Run) else run
     if not len(infos):
         raise ValueError("a history needs at least one session, got no reports")
@@ -159,9 +160,11 @@ def _history(
         )
     numbers = columns.pop("session").reshape(-1, len(infos))[0]
     coords: dict[str, Any] = {
-        "session": numbers, "feature": list(mdp.feature_names), "state": list(mdp.state_names),
+        "session": numbers,
+        "feature": list(mdp.feature_names),
+        "state": list(mdp.state_names),
         "action": list(mdp.action_names),
-    }  # fmt: skip
+    }
     if streams:
         coords["run"] = np.arange(len(weights))
     attrs = {**provenance(mdp, learner.name, learner.configuration, seed), "signature": learner.signature}

@@ -1,16 +1,16 @@
-"""Which directions of weight space the demonstrations do not determine, and what they mean.
+"""Directions of weight space that the demonstrations do not determine, and their meaning.
 
-Two different things keep a reward from being learned, and are kept apart:
+Two different properties prevent the learning of a reward:
 
 - *exactly unidentified*: moving the weights along the direction changes no policy anywhere a trajectory can
-  get, so no amount of data tells. This is a property of the features, found by linear algebra:
+  get, so no amount of data determines it. This is a property of the features, found by linear algebra:
   ``d.phi(s, a) = h(s) - gamma E[h(s')]`` for some potential ``h`` (Ng, Harada and Russell 1999), of which
   zero and constant ``d.phi`` are the simplest cases. It holds for all weights if it holds for one;
-- *weakly determined*: these demonstrations tell less about the direction than a prior would. This is
-  statistics, read off the Fisher information.
+- *weakly determined*: these demonstrations determine the direction less than a prior would. This is a
+  property of the data, in the Fisher information.
 
-The information is the observed one (:mod:`~i2rl.analysis.posteriors.information` has others): what these
-demonstrations determine is what their likelihood, hidden steps summed out, is curved in.
+The information is the observed one (:mod:`~i2rl.analysis.posteriors.information` has others): these
+demonstrations determine the directions in which their likelihood, hidden steps summed out, is curved.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _MINOR = 0.15
 
 
 class Identifiability(NamedTuple):
-    """What a demonstration determines of the weights.
+    """Directions of the weights that a demonstration determines.
 
     Fields
     ------
@@ -97,7 +97,7 @@ class Identifiability(NamedTuple):
 def _shown(
     weights: Float[Array, " K"], mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration
 ) -> tuple[Float[Array, " S"], Float[Array, " S"]]:
-    """Expected visits of each state, at all steps and at the steps that were seen."""
+    """Compute expected visits of each state, at all steps and at the steps that were seen."""
     evidence = evidence_of(mdp, sensor, demonstration)
     posterior = smooth_all(mdp, soft_plan(mdp, reward_of(mdp, weights)).log_policy, evidence)
     seen = jnp.asarray(demonstration.kind) == SEEN
@@ -121,13 +121,13 @@ def identifiability_of(
     Parameters
     ----------
     mdp, sensor, demonstration
-        The decision process, how it was perceived, what was perceived.
+        The decision process, its sensor, the observations.
     weights : float ``[K]``, optional
-        Where to look at the likelihood; the posterior mode under the prior ``Normal(0, 2.5)`` by default
-        (the likelihood itself need not have a maximum).
+        The point at which the likelihood is expanded; the posterior mode under the prior ``Normal(0, 2.5)``
+        by default (the likelihood itself need not have a maximum).
     scale : float
-        How large scaled weights (:mod:`~i2rl.models.process.units`) are reasonably thought to be. The default
-        is the prior's standard deviation: of a weak direction the demonstration says less than the prior.
+        Plausible size of scaled weights (:mod:`~i2rl.models.process.units`). The default is the prior's
+        standard deviation: a weak direction is determined by the prior more than by the demonstration.
 
     Raises
     ------
@@ -154,7 +154,7 @@ def identifiability_of(
     as_given = mdp
     mdp, theta = with_scaled_features(mdp), theta * units
     given = (mdp, sensor, demonstration.bucketed())
-    # Zero weights take every action everywhere: what they cannot have visited, nobody can.
+    # Zero weights take every action everywhere, so they visit every reachable state.
     visited = np.asarray(_shown(jnp.zeros(mdp.n_features), *given)[0]) > 0
     seen = np.asarray(_shown(jnp.asarray(theta), *given)[1]) > 1e-9
     information = observed_information(mdp, sensor, jnp.asarray(theta), demonstration)
@@ -200,7 +200,7 @@ def _standard_errors(
     variances = np.where(values > 0, 1 / np.where(values > 0, values, 1.0), inf)
     squares = np.where(axes**2 > 1e-16, axes**2, 0.0)
     with np.errstate(invalid="ignore"):
-        total = np.nansum(squares * variances, axis=1)  # nothing of an infinite variance is nothing
+        total = np.nansum(squares * variances, axis=1)  # zero times an infinite variance is zero
     for direction in exact:
         total = np.where(direction.vector != 0, inf, total)
     return np.sqrt(total)
@@ -250,7 +250,7 @@ def _cost(loss: float) -> str:
 
 
 def describe_identifiability(result: Identifiability) -> str:
-    """The findings in sentences, one direction a line."""
+    """Write the findings in sentences, one direction a line."""
     lines = [f"{d.kind}: {d.description}." for d in result.exact]
     count = len(result.features)
     head = (

@@ -1,14 +1,13 @@
-"""Fisher information about reward weights, of behaviour seen in part.
+"""Fisher information about reward weights in partly observed behaviour.
 
 Three informations answer three questions:
 
 - :func:`observed_information`: what do *these* demonstrations determine? It is the curvature of the exact
-  likelihood, hidden steps summed out, that the posterior is made of;
+  likelihood, hidden steps summed out, in the posterior;
 - :func:`expected_information`: what would demonstrations *like* these determine, of an expert who obeys the
   soft model? It plans a study; an expert who never errs is not of that kind;
-- :func:`complete_information`: what would there be to learn had nothing been hidden? An upper bound, and the
-  Hessian that the solvers iterate with. The difference to the others is information lost to occlusion
-  (Louis 1982).
+- :func:`complete_information`: what would full observation determine? An upper bound, and the Hessian that
+  the solvers iterate with. The difference to the others is information lost to occlusion (Louis 1982).
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from ...models.process.planning import features_to_go, reward_of, soft_plan
 
 @jax.jit
 def policy_sensitivity(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A K"]:
-    """Derivative of ``log pi_theta(a | s)`` by the weights; zero for unavailable actions."""
+    """Differentiate ``log pi_theta(a | s)`` by the weights; zero for unavailable actions."""
     policy = soft_plan(mdp, reward_of(mdp, weights)).policy
     to_go = features_to_go(mdp, policy)
     next_to_go = jax.vmap(mdp.expect_next, in_axes=1, out_axes=2)(to_go)

@@ -1,9 +1,10 @@
-"""Changes of a reward that leave behaviour alone, found by linear algebra and named.
+"""Changes of a reward that leave behaviour unchanged, found by linear algebra and named.
 
-A direction ``d`` of weight space changes no soft policy on a closed set of states if and only if
-``d.phi(s, a) = h(s) - gamma E[h(s')]`` there for some potential ``h`` (Ng, Harada and Russell 1999): one
-sense follows by differentiating the soft Bellman equations, the other by putting ``V + h`` into them. Zero
-and constant ``d.phi`` are the simplest cases. What holds at some weights therefore holds at all.
+A direction ``d`` of weight space changes no soft policy on a closed set of states if and only if ``d.phi(s,
+a) = h(s) - gamma E[h(s')]`` there for some potential ``h`` (Ng, Harada and Russell 1999): one sense follows
+by differentiating the soft Bellman equations, the other by putting ``V + h`` into them. Zero and constant
+``d.phi`` are the simplest cases. A direction that changes no policy at some weights therefore changes none at
+all weights.
 """
 
 from __future__ import annotations
@@ -62,34 +63,34 @@ class Direction(NamedTuple):
 
 
 def unidentified_directions(
-    mdp: TabularMDP, shown: Bool[np.ndarray, " S"] | None = None
+    mdp: TabularMDP, visited: Bool[np.ndarray, " S"] | None = None
 ) -> tuple[Direction, ...]:
-    """Directions that change no policy at any state a trajectory can get to, in sparse, named form.
+    """Find the directions that change no policy at any reachable state, in sparse, named form.
 
-    A complete basis of them: every other such direction is a sum of these. Each is named by the simplest
+    They are a complete basis: every other such direction is a sum of these. Each is named by the simplest
     reason that holds: never active, duplicate, collinear, constant, potential shaping, not visited.
 
     Parameters
     ----------
     mdp : TabularMDP
         With discount below 1.
-    shown : bool ``[S]``, optional
-        States where the demonstrations may have been. Directions that matter only where none of the ways
-        onward from those lead are *not visited*.
+    visited : bool ``[S]``, optional
+        States where the demonstrations may have been. Directions that matter only at states unreachable from
+        those are *not visited*.
 
     Raises
     ------
     ValueError
-        For discount 1, or ``shown`` of the wrong shape or empty.
+        For discount 1, or ``visited`` of the wrong shape or empty.
     """
     require_discounted(mdp)
-    if shown is not None and (np.shape(shown) != (mdp.n_states,) or not np.any(shown)):
+    if visited is not None and (np.shape(visited) != (mdp.n_states,) or not np.any(visited)):
         raise ValueError(
             f"shown must mark at least one of {mdp.n_states} states in a boolean array [{mdp.n_states}], "
-            f"got shape {np.shape(shown)} with {np.count_nonzero(shown)} marked"
+            f"got shape {np.shape(visited)} with {np.count_nonzero(visited)} marked"
         )
     reachable = reachable_states(mdp)
-    onward = reachable if shown is None else reachable_states(mdp, np.asarray(shown, float))
+    onward = reachable if visited is None else reachable_states(mdp, np.asarray(visited, float))
     available = np.asarray(mdp.available)
     pairs = available & reachable[:, None]
     features = np.asarray(mdp.features)
@@ -173,7 +174,7 @@ def _pivots(vectors: Float[np.ndarray, "K m"]) -> list[int]:
 
 
 def combination(features: Sequence[str], vector: Float[np.ndarray, " K"], least: float = 0.0) -> str:
-    """A direction in words, such as ``\\`moves\\` + 0.5 \\`turns\\```, its largest coefficient scaled to one.
+    """Write a direction in words, such as ``\\`moves\\` + 0.5 \\`turns\\```, scaled to one at most.
 
     Coefficients that are zero or below ``least`` times the largest are left out.
     """
@@ -231,12 +232,12 @@ def _named(
 
 @jax.jit
 def _features_to_go(mdp: TabularMDP) -> Float[Array, "S K"]:
-    """Expected discounted features under zero weights: their values, in the units of the weights."""
+    """Compute expected discounted features under zero weights: their values, in the units of the weights."""
     return features_to_go(mdp, soft_plan(mdp, jnp.zeros(mdp.available.shape)).policy)
 
 
 def _potential(mdp: TabularMDP, vector: Float[np.ndarray, " K"]) -> str:
-    """The potential that a shaping direction rewards the changes of."""
+    """Find the potential whose changes a shaping direction rewards."""
     scaled = vector / vector[np.argmax(np.abs(vector) > (1 - 1e-9) * np.abs(vector).max())]
     reachable = reachable_states(mdp)
     potential = np.asarray(_features_to_go(mdp)) @ scaled

@@ -1,4 +1,4 @@
-"""What a posterior predicts of the visits that were seen, against those that were."""
+"""Posterior predictive checks of the visits that were seen."""
 
 from __future__ import annotations
 
@@ -106,7 +106,7 @@ def _replicate(
     sensor: AnySensor,
     counted: Bool[Array, "n L"],
 ) -> tuple[Float[Array, "D S"], Float[Array, "D S"]]:
-    """Simulated and exactly expected counts of the steps seen in each state, for every draw."""
+    """Simulate the steps seen in each state, and compute their exact expectation, for every draw."""
     n, length = counted.shape
 
     def one(inputs: tuple) -> tuple:
@@ -119,7 +119,7 @@ def _replicate(
 
         codes = jax.vmap(perceive)(jax.random.split(key, n))
         seen = counted & (codes[..., 0] == SEEN)
-        # Out of range, and so dropped, where nothing is counted.
+        # Out of range, and so dropped, at steps that are not counted.
         place = jnp.where(seen, codes[..., 1], mdp.n_states)
         visits = jnp.zeros(mdp.n_states, int).at[place].add(1, mode="drop")
         return visits, _expected_visits(mdp, plan.policy, sensor, jnp.sum(counted, 0))
@@ -130,7 +130,9 @@ def _replicate(
 def _expected_visits(
     mdp: TabularMDP, policy: Float[Array, "S A"], sensor: AnySensor, steps: Array
 ) -> Float[Array, " S"]:
-    """Expected number of steps seen in each state, ``steps [L]`` being how many are counted at each time."""
+    """Compute the expected number of steps seen in each state; ``steps [L]`` counts the trajectories at each
+    time.
+    """
     pairs = finite_occupancy(mdp, jnp.broadcast_to(policy, (len(steps), *policy.shape)))
     total = jnp.einsum("t,tsa->sa", steps, pairs)
     if sensor.visibility is not None:
@@ -174,9 +176,12 @@ def predictive_check(idata: az.InferenceData, coverage: float = 0.9) -> xr.Datas
 
     return xr.Dataset(
         {
-            "observed": observed, "median": median, "low": low, "high": high,
+            "observed": observed,
+            "median": median,
+            "low": low,
+            "high": high,
             "p_value": (draws > observed).mean(over) + 0.5 * (draws == observed).mean(over),
             "discrepancy_p_value": (discrepancy(draws) >= discrepancy(observed)).mean(),
         },
         attrs={"coverage": coverage},
-    )  # fmt: skip
+    )

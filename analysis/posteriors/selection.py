@@ -1,13 +1,13 @@
-"""Which features does the expert care about? Feature sets compared by leave-one-out cross-validation.
+"""Selection of features: feature sets compared by leave-one-out cross-validation.
 
 Each set gives a posterior; the sets are ranked by how well they predict a trajectory from all the others
 (expected log predictive density, PSIS-LOO of Vehtari, Gelman and Gabry 2017, by ArviZ). The unit left out is
 the trajectory, hidden steps summed out: steps of one trajectory are not independent. Fragments of one long
-walk are not independent either; they are treated as the model treats them.
+walk are not independent either; the model treats them as such.
 
-A feature that the expert does not care about adds nothing to the prediction but a weight to estimate, so a
-set without it ranks at least as high, typically by some tenths of a nat. A difference is worth something
-only where it is several times its standard error (``elpd_diff`` against ``dse``).
+An irrelevant feature adds only a weight to estimate to the prediction, so a set without it ranks at least as
+high, typically by some tenths of a nat. A difference is significant only if it is several times its standard
+error (``elpd_diff`` against ``dse``).
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ PARETO_LIMIT = 0.7
 
 
 class FeatureComparison(NamedTuple):
-    """Feature sets ranked.
+    """Ranking of feature sets.
 
     Fields
     ------
@@ -44,7 +44,7 @@ class FeatureComparison(NamedTuple):
         ``warning``.
     pareto_k : DataFrame
         For each set: the largest ``k``, the share of trajectories above 0.7, and the trajectory of the
-        largest. Where there are some above, the ranking rests on importance weights that cannot be trusted.
+        largest. With some above, the ranking rests on unreliable importance weights.
     posteriors : the posteriors, by name
     """
 
@@ -61,7 +61,7 @@ class FeatureComparison(NamedTuple):
 def with_features(
     mdp: TabularMDP, features: Float[np.ndarray, "S A K"], names: Sequence[str] | None = None
 ) -> TabularMDP:
-    """The same process with other features ``[S, A, K]``, by other names.
+    """Return the same process with other features ``[S, A, K]``, by other names.
 
     Raises ``ValueError`` for features of another shape or not finite where an action is available, and for
     names of the wrong number or repeated.
@@ -80,7 +80,7 @@ def with_features(
 
 
 def select_features(mdp: TabularMDP, names: Sequence[str]) -> TabularMDP:
-    """The same process with only the features of these names, in this order.
+    """Return the same process with only the features of these names, in this order.
 
     Raises ``ValueError`` naming an unknown or repeated feature, or for no names at all.
     """
@@ -105,7 +105,7 @@ def compare_features(
 ) -> FeatureComparison:
     """Sample a posterior for each feature set and rank the sets.
 
-    Trajectories that say nothing (all frames lost) are left out: every set predicts them alike.
+    Trajectories without evidence (all frames lost) are left out: every set predicts them equally.
 
     Parameters
     ----------
@@ -113,15 +113,15 @@ def compare_features(
     mdps : mapping of names to TabularMDP
         The same process with different features, see :func:`with_features` and :func:`select_features`.
     sensor, demonstration
-        How the expert was perceived, and what was perceived.
+        The expert's sensor, and its observations.
     options
         As for :func:`sample_posterior`. Hidden steps are not drawn unless ``completions=True``.
 
     Raises
     ------
     ValueError
-        For fewer than two sets, processes that differ in more than features, fewer than two trajectories
-        that say something; and as :func:`sample_posterior`.
+        For fewer than two sets, processes that differ in more than features, fewer than two trajectories with
+        evidence; and as :func:`sample_posterior`.
     """
     _require_same_process(mdps)
     kind = np.asarray(demonstration.kind)

@@ -22,13 +22,13 @@ from matplotlib.patches import Rectangle
 from ...models.process.mdp import TabularMDP
 
 DPI = 100
-# Okabe and Ito (2008): told apart by people who do not see red and green alike.
+# Okabe and Ito (2008): distinct also to people who do not see red and green alike.
 PAGE, INK, MUTED, FLOOR, WALL = "#ffffff", "#1b1f24", "#6b7580", "#e1e6eb", "#57606a"
 AGENT, GOAL, WATER = "#d55e00", "#00805d", "#0072b2"
 
 
 class Frame(NamedTuple):
-    """What a caption says: the state, and the action and reward that led to it (None after a reset)."""
+    """Content of a caption: the state, and the action and reward that led to it (None after a reset)."""
 
     state: int
     action: int | None = None
@@ -36,7 +36,7 @@ class Frame(NamedTuple):
 
 
 class Backdrop:
-    """What stands still, drawn once, with artists and a caption that change from picture to picture."""
+    """Static scene, drawn once, with artists and a caption that change from picture to picture."""
 
     def __init__(self, axes: Axes, moving: Sequence[Artist]):
         self._axes = axes
@@ -51,7 +51,7 @@ class Backdrop:
         self._background = self._canvas.copy_from_bbox(axes.figure.bbox)
 
     def picture(self, caption: str) -> UInt8[np.ndarray, "height width 3"]:
-        """Everything as it is now, in red, green and blue from 0 to 255."""
+        """Return the current picture in red, green and blue from 0 to 255."""
         self._canvas.restore_region(self._background)
         self._caption.set_text(caption)
         for artist in sorted(self._moving, key=Artist.get_zorder):
@@ -76,18 +76,20 @@ class Scene:
         self._mdp, self._place, self._columns = mdp, place, columns
         self._backdrop = Backdrop(axes, moving)
 
-    def frame(self, shown: Frame) -> UInt8[np.ndarray, "height width 3"]:
-        """The picture of a state."""
-        self._place(shown.state)
-        return self._backdrop.picture(caption(self._mdp, shown, self._columns))
+    def frame(self, content: Frame) -> UInt8[np.ndarray, "height width 3"]:
+        """Draw a state."""
+        self._place(content.state)
+        return self._backdrop.picture(caption(self._mdp, content, self._columns))
 
 
-def caption(mdp: TabularMDP, shown: Frame, columns: int = 10_000) -> str:
-    """The last action and its reward, and the state reached, in lines of at most so many characters."""
+def caption(mdp: TabularMDP, content: Frame, columns: int = 10_000) -> str:
+    """Write the last action and its reward, and the state reached, in lines of at most so many characters."""
     last = (
-        "begins" if shown.action is None else f"{mdp.action_names[shown.action]}, reward {shown.reward:.3g}"
+        "begins"
+        if content.action is None
+        else f"{mdp.action_names[content.action]}, reward {content.reward:.3g}"
     )
-    return f"{fill(last, columns)}\n{fill(mdp.state_names[shown.state], columns)}"
+    return f"{fill(last, columns)}\n{fill(mdp.state_names[content.state], columns)}"
 
 
 def new_canvas(
@@ -109,7 +111,7 @@ def draw_cell(axes: Axes, row: int, column: int, color: str) -> None:
 
 
 def draw_key(axes: Axes, marks: Sequence[tuple[str, str, str]], columns: int = 4) -> None:
-    """What marks mean, above everything: (marker, colour, meaning), so many side by side."""
+    """Draw a key of the marks above everything: (marker, colour, meaning), so many side by side."""
     handles = []
     for marker, color, meaning in marks:
         handle = Line2D([], [], linestyle="", marker=marker, color=color, markersize=8, label=meaning)
@@ -119,13 +121,21 @@ def draw_key(axes: Axes, marks: Sequence[tuple[str, str, str]], columns: int = 4
             handle.set_markeredgewidth(1.8)
         handles.append(handle)
     axes.legend(
-        handles=handles, loc="upper left", ncols=columns, frameon=False, fontsize=8, labelcolor=INK,
-        borderaxespad=0.1, handletextpad=0.1, columnspacing=0.9, handlelength=1.6,
-    )  # fmt: skip
+        handles=handles,
+        loc="upper left",
+        ncols=columns,
+        frameon=False,
+        fontsize=8,
+        labelcolor=INK,
+        borderaxespad=0.1,
+        handletextpad=0.1,
+        columnspacing=0.9,
+        handlelength=1.6,
+    )
 
 
 def number_cells(axes: Axes, rows: range, columns: range, gap: float = 0.62) -> None:
-    """The numbers by which state names tell cells, outside the grid's first row and column."""
+    """Write the cells' numbers, as in state names, outside the grid's first row and column."""
     for row in rows:
         axes.text(columns[0] - gap, row, str(row), color=MUTED, fontsize=7, ha="right", va="center")
     for column in columns:
@@ -133,7 +143,7 @@ def number_cells(axes: Axes, rows: range, columns: range, gap: float = 0.62) -> 
 
 
 def text_scene(mdp: TabularMDP) -> Scene:
-    """The scene of a process nobody drew: what is done and where it leads, in words."""
+    """Make a scene in words, for a process without a picture: the action and the state it leads to."""
     axes = new_canvas(0, 10, 0, 1, 40, caption=2)
     axes.text(0.2, 0.6, "state and last action", color=MUTED, fontsize=9, va="center")
     return Scene(axes, mdp, (), lambda state: None, 60)

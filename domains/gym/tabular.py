@@ -18,13 +18,13 @@ if TYPE_CHECKING:
 
 
 class TabularEnv(gymnasium.Env[int, int]):
-    """A finite decision process and a reward as a Gymnasium environment.
+    """Finite decision process and a reward as a Gymnasium environment.
 
     Observations are states, actions the process's actions. ``info["action_mask"]`` (int8, ``[A]``) says at
     every reset and step which actions the state offers; ``env.action_space.sample(info["action_mask"])``
-    draws among them. An action that is not offered changes nothing and earns nothing, and
-    ``info["available"]`` is then False; with ``strict`` it is a ``ValueError`` that names state and action.
-    The reward of a step is ``weights . phi(s, a)``, an expectation where features depend on what happens.
+    draws among them. An action that is not offered changes nothing, earns zero and sets ``info["available"]``
+    to False; with ``strict`` it raises a ``ValueError`` that names state and action. The reward of a step is
+    ``weights . phi(s, a)``, an expectation if features depend on the outcome.
 
     Episodes never terminate. ``reset(options={"state": ...})`` begins in a state given by number or name,
     otherwise the first state is drawn from the process's initial distribution.
@@ -36,7 +36,7 @@ class TabularEnv(gymnasium.Env[int, int]):
     render_mode : "rgb_array", "ansi" or None
     strict : bool
     scene : function of no arguments or None
-        Makes the picture for ``rgb_array`` when it is first asked for; None draws the state's name.
+        Makes the first picture for ``rgb_array``; None draws the state's name.
 
     Raises
     ------
@@ -91,7 +91,7 @@ class TabularEnv(gymnasium.Env[int, int]):
         given = dict(options or {})
         state = given.pop("state", None)
         if given:
-            raise ValueError(f"reset knows the option 'state' only, got {', '.join(map(repr, given))}")
+            raise ValueError(f"reset takes only the option 'state', got {', '.join(map(repr, given))}")
         if state is None:
             self._state = drawn(self._initial, self.np_random.random())
         else:
@@ -110,7 +110,7 @@ class TabularEnv(gymnasium.Env[int, int]):
         return int(state)
 
     def step(self, action: int) -> tuple[int, float, bool, bool, dict[str, Any]]:
-        """Do an action: the state reached, its reward, False, False, and ``action_mask`` and ``available``.
+        """Apply an action; return the state, its reward, False, False, and ``action_mask`` and ``available``.
 
         Raises ``ValueError`` for an action that does not exist, and if ``strict`` for one that the state does
         not offer; ``gymnasium.error.ResetNeeded`` before the first reset.
@@ -136,7 +136,7 @@ class TabularEnv(gymnasium.Env[int, int]):
         return self._state, reward, False, False, info
 
     def render(self) -> UInt8[np.ndarray, "height width 3"] | str | None:
-        """A picture (``rgb_array``), the caption alone (``ansi``), or None without a render mode."""
+        """Return a picture (``rgb_array``), the caption alone (``ansi``), or None without a render mode."""
         if self.render_mode is None:
             gymnasium.logger.warn("render was called without a render_mode; make the environment with one")
             return None

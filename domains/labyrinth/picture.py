@@ -17,7 +17,7 @@ from .process import HOME, N_NODES, WATER_PORT, Labyrinth, maze_positions, paren
 
 
 def labyrinth_scene(labyrinth: Labyrinth) -> Scene:
-    """The maze with its water port and the mouse, nose where it is going."""
+    """Draw the maze with its water port and the mouse, which faces its destination."""
     places = maze_positions()
     axes = new_canvas(-15.5, 15.5, -17.5, 15.5, 16, caption=3)
     axes.add_patch(Rectangle((-15.5, -17.5), 31, 33, facecolor=WALL, zorder=0))
@@ -59,7 +59,7 @@ _DROP = np.array(
 
 
 def _previous_nodes(labyrinth: Labyrinth) -> np.ndarray:
-    """The node each state was entered from."""
+    """Find the node from which each state was entered."""
     previous = np.full(len(labyrinth.node), -1)
     successors = np.asarray(labyrinth.mdp.successors)[..., 0]
     for s, a in np.argwhere(np.asarray(labyrinth.mdp.available)):
@@ -67,7 +67,7 @@ def _previous_nodes(labyrinth: Labyrinth) -> np.ndarray:
     start = np.asarray(labyrinth.mdp.initial) > 0
     previous[start] = HOME
     previous[labyrinth.node == HOME] = 0
-    # What nothing leads to was entered from above.
+    # A state without predecessor was entered from above.
     unknown = previous < 0
     previous[unknown] = [parent_of(int(n)) for n in labyrinth.node[unknown]]
     return previous

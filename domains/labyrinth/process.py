@@ -5,10 +5,10 @@ Six levels of T-junctions below a root, 63 junctions and 64 ends: node ``n`` has
 reached from node 0. A thirsty animal finds water at end 116. A *bout* is one visit: it begins at node 0 and
 ends at home.
 
-The process has a state for every node and way of entering it, so that turning round is a property of a
-pair, and deterministic moves named after where they lead: ``back`` to the parent (from the root: home),
-``left`` and ``right`` to the children. Every recorded step is therefore exactly one action. At an end only
-``back`` is available. Home absorbs.
+The process has a state for every node and entrance to it, so that turning round is a property of a pair, and
+deterministic moves named after where they lead: ``back`` to the parent (from the root: home), ``left`` and
+``right`` to the children. Every recorded step is therefore exactly one action. At an end only ``back`` is
+available. Home absorbs.
 """
 
 from __future__ import annotations
@@ -50,28 +50,33 @@ HOME = N_NODES
 WATER_PORT = 116
 ACTIONS = ("back", "left", "right")
 BACK, LEFT, RIGHT = range(3)
-# How a junction was entered; an end can be entered in one way only, and is a kind of its own.
+# How a junction was entered; an end has one entrance, and is a kind of its own.
 ENTRIES = ("from above", "from the left child", "from the right child", "at an end", "at home")
 FROM_ABOVE, FROM_LEFT, FROM_RIGHT, AT_END, AT_HOME = range(5)
 SHARED_FEATURES = (
-    "reaches home", "reaches the water port", "reaches an end", "turns round", "goes deeper", "level",
-)  # fmt: skip
+    "reaches home",
+    "reaches the water port",
+    "reaches an end",
+    "turns round",
+    "goes deeper",
+    "level",
+)
 _TURNS_ROUND, _GOES_DEEPER = 3, 4
 _NODE_FEATURES = tuple(f"reaches {n}" for n in range(N_NODES))
 
 
 def level_of(node: int) -> int:
-    """Number of junctions above a node, 0 for the root to 6 for the ends; -1 for home."""
+    """Count the junctions above a node: 0 for the root to 6 for the ends; -1 for home."""
     return -1 if node == HOME else (node + 1).bit_length() - 1
 
 
 def parent_of(node: int) -> int:
-    """The node a step back leads to."""
+    """Return the node that a step back leads to."""
     return HOME if node == 0 else (node - 1) // 2
 
 
 def destination(node: int, action: int) -> int | None:
-    """The node an action leads to; None where the action does not exist."""
+    """Return the node that an action leads to, or None if the action does not exist."""
     if node == HOME:
         return HOME if action == BACK else None
     if action == BACK:
@@ -124,7 +129,7 @@ class Labyrinth(NamedTuple):
         return inside[self.node]
 
     def without_left_half(self) -> Visibility:
-        """A view of everything but the left half of the maze, from node 1 on."""
+        """Return the visibility of all states outside the left half of the maze (node 1 and below)."""
         return Visibility(~self.below(1))
 
 
@@ -149,7 +154,8 @@ def mouse_labyrinth(discount: float = 0.9) -> Labyrinth:
 
 @cache
 def labyrinth_by_level(discount: float = 0.9) -> Labyrinth:
-    """The labyrinth with further features: turning round and going deeper, from each level (145 in all).
+    """Build the labyrinth with further features: turning round and going deeper, from each level (145 in
+    all).
 
     A reward that is stationary and linear in the features of :func:`labyrinth` asks for one propensity to
     turn and one to go deeper everywhere. This one lets them differ from level to level.
@@ -201,7 +207,7 @@ def _build(
 
 
 def _entry(node: int, target: int) -> int:
-    """How ``target`` is entered from ``node``."""
+    """Return the action that leads from ``node`` to ``target``."""
     if target == HOME:
         return AT_HOME
     if target >= FIRST_END:
@@ -214,9 +220,13 @@ def _entry(node: int, target: int) -> int:
 def _features(node: int, entry: int, action: int, target: int) -> Float[np.ndarray, " K"]:
     came_from = {FROM_ABOVE: BACK, FROM_LEFT: LEFT, FROM_RIGHT: RIGHT, AT_END: BACK}[entry]
     shared = [
-        target == HOME, target == WATER_PORT, FIRST_END <= target < N_NODES, action == came_from,
-        action != BACK, max(level_of(target), 0) / LEVELS,
-    ]  # fmt: skip
+        target == HOME,
+        target == WATER_PORT,
+        FIRST_END <= target < N_NODES,
+        action == came_from,
+        action != BACK,
+        max(level_of(target), 0) / LEVELS,
+    ]
     return np.concatenate([np.array(shared, float), np.arange(N_NODES) == target])
 
 
@@ -324,7 +334,7 @@ def pairs_of(maze: Labyrinth, nodes: Sequence[int]) -> tuple[Int[np.ndarray, " L
 def nodes_of(
     maze: Labyrinth, states: Int[np.ndarray, " L"], actions: Int[np.ndarray, " L"]
 ) -> tuple[int, ...]:
-    """The nodes that pairs pass through, the last one reached included; inverse of :func:`pairs_of`."""
+    """List the nodes that pairs pass through, with the last one reached; the inverse of :func:`pairs_of`."""
     last = np.asarray(maze.mdp.successors)[states[-1], actions[-1], 0]
     return tuple(int(n) for n in maze.node[[*states, last]])
 
@@ -334,9 +344,9 @@ def demonstration_of(maze: Labyrinth, bouts: Sequence[Bout]) -> Demonstration:
     return concatenate([Demonstration.from_pairs(*pairs_of(maze, bout.nodes)) for bout in bouts])
 
 
-def conceal(demonstration: Demonstration, view: Visibility) -> Demonstration:
+def conceal(demonstration: Demonstration, visibility: Visibility) -> Demonstration:
     """Hide the steps in states that a view (a mask) does not cover; they stay in place, as hidden steps."""
-    covered = np.asarray(view.in_view) > 0
+    covered = np.asarray(visibility.in_view) > 0
     kind = np.asarray(demonstration.kind)
     hidden = (kind == SEEN) & ~covered[demonstration.state]
     return Demonstration(

@@ -21,16 +21,16 @@ class _SwapFields(NamedTuple):
 @shown_briefly
 @rebuilt_unchecked
 class SwapNoise(_SwapFields):
-    """Confusions that happen independently of each other: the report is the truth with some swaps applied.
+    """Independent confusions of pairs: the observation is the truth with some swaps applied.
 
     Parameters
     ----------
     swaps : int ``[M, S, A]``
-        What each confusion takes a pair for, as the flat index ``s * A + a``; the pair itself where it has
-        nothing to confuse. Each is its own inverse, their order does not matter, and different ones applied
-        to a pair give different reports.
+        Observation of a pair under each swap, as the flat index ``s * A + a``; the pair itself where the swap
+        does not apply. Each swap is its own inverse, swaps commute, and different swaps of a pair give
+        different observations.
     chances : float ``[M]``
-        Probability of each, where it has something to confuse.
+        Probability of each swap where it applies.
 
     Raises
     ------
@@ -56,44 +56,46 @@ class SwapNoise(_SwapFields):
         return super().__new__(cls, flat, jnp.asarray(chances if p is None else p, float))
 
     def __mul__(self, other: AnySensor) -> Sensor:  # type: ignore[override]
-        """Compose with another imperfection, such as a :class:`Visibility`."""
+        """Compose with another sensor, such as a :class:`Visibility`."""
         return self.noise * other
 
     @property
     def visibility(self) -> None:
-        """Noise hides nothing."""
+        """None: this noise hides no step."""
         return None
 
     @property
     def acts(self) -> Bool[Array, "M S A"]:
-        """Where each swap has something to confuse."""
+        """Pairs that each swap changes."""
         return self.swaps != jnp.arange(self.swaps[0].size).reshape(self.swaps.shape[1:])
 
     @property
     def noise(self) -> ObservationModel:
-        """``O(o | g)``: the report is the truth with a random subset of the swaps applied."""
+        """Observation model ``O(o | g)``: ``o`` is the truth with a random subset of the swaps applied."""
         shape, (m, size) = self.swaps.shape[1:], self.swaps.reshape(len(self.chances), -1).shape
         chosen = _subsets(m)
         weights = jnp.prod(jnp.where(chosen, self.chances, 1 - self.chances), axis=1)
         table = jnp.zeros((size, size))
-        for weight, report in zip(weights, self._reports(), strict=True):
-            table = table.at[jnp.arange(size), report].add(weight)
+        for weight, observation in zip(weights, self._observations(), strict=True):
+            table = table.at[jnp.arange(size), observation].add(weight)
         return ObservationModel._make((jnp.log(table).reshape(*shape, *shape),))
 
-    def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
-        """Which swaps turned each truth into its report (flat indices); none where no swaps do."""
-        # The first subset that explains a report holds no swap without effect.
-        return jnp.asarray(_subsets(len(self.chances)))[(self._reports()[:, truth] == report).argmax(0)]
+    def confused(self, truth: Int[Array, " n"], observation: Int[Array, " n"]) -> Bool[Array, "n M"]:
+        """Find the swaps that turned each truth into its observation (flat indices); none if no swaps do."""
+        # The first subset that explains an observation holds no swap without effect.
+        return jnp.asarray(_subsets(len(self.chances)))[
+            (self._observations()[:, truth] == observation).argmax(0)
+        ]
 
-    def _reports(self) -> Int[Array, "2**M S*A"]:
+    def _observations(self) -> Int[Array, "2**M S*A"]:
         flat = self.swaps.reshape(len(self.chances), -1)
-        reports = []
+        observations = []
         for subset in _subsets(len(self.chances)):
-            report = jnp.arange(flat.shape[1])
+            observation = jnp.arange(flat.shape[1])
             for m in np.flatnonzero(subset):
-                report = flat[m][report]
-            reports.append(report)
-        return jnp.stack(reports)
+                observation = flat[m][observation]
+            observations.append(observation)
+        return jnp.stack(observations)
 
 
 def _subsets(m: int) -> Bool[np.ndarray, "2**M M"]:
@@ -118,7 +120,7 @@ def _checked_swaps(swaps: np.ndarray) -> Int[np.ndarray, "M S A"]:
         for n in range(m):
             other = flat[n]
             if (swap[other] != other[swap]).any():
-                raise ValueError(f"swaps {n} and {m} give different reports in different order")
+                raise ValueError(f"swaps {n} and {m} do not commute")
             if ((swap == other) & (swap != pairs)).any():
                 raise ValueError(f"swaps {n} and {m} take a pair for the same other pair")
     return swaps

@@ -1,19 +1,20 @@
 """Two tasks seen through noisy perception (section 7.4.3): sorting onions, and one patroller.
 
-A report of perception is a pair ``(s, a)`` that may be wrong. What it gets right and wrong is described by
-*predicates* on pairs (appendix F); the learner of chapter 6.1 estimates how reliably each is reported.
+An observation is a pair ``(s, a)`` that may be wrong. *Predicates* on pairs (appendix F) describe its errors;
+the learner of chapter 6.1 estimates the reliability of each predicate.
 
 The dissertation flips "blemished onion", "onion to bin" and "onion to table" with probability 0.3 each and
-nothing else. No report can do that: "onion to bin" and "hand to bin" are one function of the pair, so are
-"onion to table" and "hand to table", and a release is at the bin or on the table. The simulation here says
-what is confused instead, as a :class:`SwapNoise`: a known prediction with its opposite, and independently
-the place of release with the other place. For the patroller, moving forward is confused with turning right.
-Such a noise *is* an observation model: it injects the errors (:func:`demonstrate_noisy`), gives the evidence
-of a learner who knows it, and the true agreement probabilities (:func:`agreement_probabilities`).
-:func:`feature_noise` is the other injector, exact under Eq. 6.5 normalised.
+leaves the others. No pair satisfies that: "onion to bin" and "hand to bin" are one function of the pair, so
+are "onion to table" and "hand to table", and a release is at the bin or on the table. The simulation here
+states confusions of pairs instead, as a :class:`SwapNoise`: a known prediction with its opposite, and
+independently the place of release with the other place. For the patroller, moving forward is confused with
+turning right. Such a noise *is* an observation model: it injects the errors (:func:`demonstrate_noisy`),
+gives the evidence of a learner with a known sensor, and the true agreement probabilities
+(:func:`agreement_probabilities`). :func:`feature_noise` is the other injector, exact under Eq. 6.5
+normalised.
 
-A report may be of a pair that the task does not offer, such as releasing a good onion over the bin:
-perception does not know the task.
+An observation may be a pair that the task does not offer, such as releasing a good onion over the bin:
+perception is independent of the task.
 """
 
 from __future__ import annotations
@@ -50,9 +51,15 @@ Starts = Literal["all", "natural"]
 Scores = Literal["calibrated", "product"]
 
 SORTING_PREDICATES = (
-    "blemished onion", "move with hand", "start from conveyor", "leaving at eye", "onion to bin",
-    "hand to bin", "onion to table", "hand to table",
-)  # fmt: skip
+    "blemished onion",
+    "move with hand",
+    "start from conveyor",
+    "leaving at eye",
+    "onion to bin",
+    "hand to bin",
+    "onion to table",
+    "hand to table",
+)
 PATROL_PREDICATES = ("move forward", "turn left", "in the top row", "turn right")
 
 SORTING_LABELS = ("onion location", "hand location")
@@ -66,7 +73,7 @@ CONCENTRATION = 4.0
 
 
 def sorting_predicates(sorting: onions.Sorting) -> Bool[np.ndarray, "8 S A"]:
-    """The eight observation features of onion sorting (appendix F.2), in the order of the dissertation.
+    """Compute the eight observation features of onion sorting (appendix F.2), in the dissertation's order.
 
     As functions of a pair the fifth and the sixth are one, and so are the last two: only the product of
     their reliabilities can be learned.
@@ -76,17 +83,23 @@ def sorting_predicates(sorting: onions.Sorting) -> Bool[np.ndarray, "8 S A"]:
     to_table, to_bin = action == onions.PLACE_ON_CONVEYOR, action == onions.PLACE_IN_BIN
     moves = to_table | to_bin | (action == onions.PICK)
     return _stacked(
-        prediction == onions.BLEMISHED, moves, onion == onions.TABLE, (hand == onions.AT_EYES) & moves,
-        to_bin, to_bin, to_table, to_table,
-    )  # fmt: skip
+        prediction == onions.BLEMISHED,
+        moves,
+        onion == onions.TABLE,
+        (hand == onions.AT_EYES) & moves,
+        to_bin,
+        to_bin,
+        to_table,
+        to_table,
+    )
 
 
 def patrol_predicates(patrol: patrols.Patrol) -> Bool[np.ndarray, "4 S A"]:
-    """The four observation features of the patroller (appendix F.1).
+    """Compute the four observation features of the patroller (appendix F.1).
 
-    "y is 0" is read as the row, the hallway's far arm: no cell of instance 2 has column 0, so that the other
-    reading would be false everywhere. The released program uses "turns right" nowhere; the dissertation,
-    followed here, does.
+    "y is 0" means the row, the hallway's far arm: no cell of instance 2 has column 0, so the column would
+    make it false everywhere. The released program uses "turns right" nowhere; the dissertation, followed
+    here, does.
     """
     row = np.array([state.row for state in patrol.states])[:, None]
     action = np.arange(patrol.mdp.n_actions)[None]
@@ -94,13 +107,13 @@ def patrol_predicates(patrol: patrols.Patrol) -> Bool[np.ndarray, "4 S A"]:
 
 
 def sorting_labels(sorting: onions.Sorting) -> Int[np.ndarray, "2 S A"]:
-    """Where the onion and the hand are, in the codes of ``sorting.factors``."""
+    """Return the places of the onion and of the hand, in the codes of ``sorting.factors``."""
     places = np.asarray(sorting.factors)[:, [0, 2]].T
     return np.tile(places[..., None], sorting.mdp.n_actions)
 
 
 def patrol_labels(patrol: patrols.Patrol) -> Int[np.ndarray, "1 S A"]:
-    """The state's index."""
+    """Return the state's index."""
     return np.tile(np.arange(patrol.mdp.n_states)[None, :, None], patrol.mdp.n_actions)
 
 
@@ -145,21 +158,21 @@ class NoisyTask(NamedTuple):
 
     @property
     def features(self) -> Int[np.ndarray, "J+M S A"]:
-        """Predicates and labels: all that perception can get right or wrong.
+        """Predicates and labels that perception observes.
 
-        The dissertation's predicates leave most of a pair open, and a model of nothing else has states that
-        they do not tell apart reported at random. Nobody tells the learner that labels are clear: their
-        reliabilities are learned, too.
+        The dissertation's predicates leave most of a pair open. A model of the predicates alone observes
+        states at random that the predicates do not distinguish. The reliabilities of the labels are learned,
+        too.
         """
         return np.concatenate([self.predicates.astype(int), self.labels])
 
     @property
     def feature_names(self) -> tuple[str, ...]:
-        """Of :attr:`features`."""
+        """Names of :attr:`features`."""
         return self.predicate_names + self.label_names
 
     def starting(self, starts: Starts) -> TabularMDP:
-        """The process begun anywhere (``"all"``, uniformly) or where it ``"natural"``ly is.
+        """Return the process begun in all states alike (``"all"``) or at its ``"natural"`` start.
 
         Raises ``ValueError`` for another word.
         """
@@ -170,7 +183,7 @@ class NoisyTask(NamedTuple):
         raise ValueError(f"starts are 'all' or 'natural', got {starts!r}")
 
     def pair_distribution(self, starts: Starts = "all", steps: int = 3) -> Float[np.ndarray, "S A"]:
-        """How often the expert is at each pair in ``steps`` steps (exact; sums to one)."""
+        """Compute the expert's distribution over pairs in ``steps`` steps (exact; sums to one)."""
         if steps < 1:
             raise ValueError(f"a trajectory needs at least one step, got {steps}")
         policies = jnp.broadcast_to(jnp.asarray(self.expert_policy), (steps, *self.expert_policy.shape))
@@ -180,13 +193,13 @@ class NoisyTask(NamedTuple):
 def noisy_sorting(
     prediction_noise: float = SWAP, place_noise: float = SWAP, sorting: onions.Sorting | None = None
 ) -> NoisyTask:
-    """Pick-inspect-place on 22 states, watched by somebody who mistakes predictions and places.
+    """Make pick-inspect-place on 22 states, with a sensor that confuses predictions and places.
 
-    With ``prediction_noise`` a known prediction is reported as its opposite; independently, with
-    ``place_noise``, placing an onion on the conveyor is reported as placing it in the bin and the other way
-    round. In ``pick_inspect_place()`` the opposite of every known prediction exists; in another ``sorting``
-    it may be no state of the process, and is then reported rightly. The natural start is an unknown onion on
-    the table. Raises ``ValueError`` for noise outside [0, 1].
+    With ``prediction_noise`` a known prediction is observed as its opposite; independently, with
+    ``place_noise``, placing an onion on the conveyor is observed as placing it in the bin, and conversely. In
+    ``pick_inspect_place()`` the opposite of every known prediction exists; in another ``sorting`` it may be
+    no state of the process; the prediction is then observed correctly. The natural start is an unknown onion
+    on the table. Raises ``ValueError`` for noise outside [0, 1].
     """
     sorting = onions.pick_inspect_place() if sorting is None else sorting
     index = {tuple(row): s for s, row in enumerate(np.asarray(sorting.factors).tolist())}
@@ -200,34 +213,47 @@ def noisy_sorting(
         _flat(sorting.mdp, actions=_exchanged(sorting.mdp, onions.PLACE_ON_CONVEYOR, onions.PLACE_IN_BIN)),
     )
     return NoisyTask(
-        "noisy " + sorting.name, sorting.mdp, sorting.weights[0], sorting.expert_policy(0),
-        SORTING_PREDICATES, sorting_predicates(sorting),
+        "noisy " + sorting.name,
+        sorting.mdp,
+        sorting.weights[0],
+        sorting.expert_policy(0),
+        SORTING_PREDICATES,
+        sorting_predicates(sorting),
         SwapNoise(np.stack(swaps), np.array([prediction_noise, place_noise])),
-        SORTING_LABELS, sorting_labels(sorting),
-    )  # fmt: skip
+        SORTING_LABELS,
+        sorting_labels(sorting),
+    )
 
 
 def noisy_patrol(noise: float = SWAP) -> NoisyTask:
-    """One patroller of instance 2, whose moves forward and right turns are mistaken for each other.
+    """Make one patroller of instance 2, with a sensor that confuses moves forward and right turns.
 
-    Where it is, left turns and stops are reported rightly. It naturally starts somewhere on its loop (the
-    stationary distribution of its policy). Raises ``ValueError`` for noise outside [0, 1].
+    The sensor observes its place, left turns and stops correctly. The natural start is somewhere on its loop
+    (the stationary distribution of its policy). Raises ``ValueError`` for noise outside [0, 1].
     """
     patrol = patrols.instance(2)
     policy = patrol.expert_policy()
     mdp = replace(patrol.mdp, initial=jnp.asarray(_stationary(patrol.mdp, policy)))
     swap = _flat(mdp, actions=_exchanged(mdp, patrols.FORWARD, patrols.RIGHT))
     return NoisyTask(
-        "noisy patrol", mdp, patrol.weights, policy, PATROL_PREDICATES, patrol_predicates(patrol),
-        SwapNoise(swap[None], np.array([noise])), PATROL_LABELS, patrol_labels(patrol),
-    )  # fmt: skip
+        "noisy patrol",
+        mdp,
+        patrol.weights,
+        policy,
+        PATROL_PREDICATES,
+        patrol_predicates(patrol),
+        SwapNoise(swap[None], np.array([noise])),
+        PATROL_LABELS,
+        patrol_labels(patrol),
+    )
 
 
 def feature_noise(task: NoisyTask, confused: float = 1 - SWAP, clear: float = 0.99) -> FeatureNoise:
-    """Noise that Eq. 6.5, normalised, describes exactly, on the predicates that the task's own noise changes.
+    """Make noise that follows Eq. 6.5, normalised, exactly, on the predicates that the task's own noise
+    changes.
 
-    Those have reliability ``confused``, the others ``clear``. Reports range over all pairs, so that a report
-    with every predicate right is often of another pair than the truth.
+    Those have reliability ``confused``, the others ``clear``. Observations range over all pairs, so an
+    observation with every predicate right is often another pair than the truth.
     """
     psi = task.predicates.reshape(len(task.predicates), -1)
     changes = (psi[:, np.asarray(task.noise.swaps).reshape(len(task.noise.chances), -1)] != psi[:, None]).any(
@@ -265,10 +291,11 @@ def _stationary(mdp: TabularMDP, policy: Float[np.ndarray, "S A"]) -> Float[np.n
 def agreement_probabilities(
     noise: AnySensor, predicates: np.ndarray | Array, weights: np.ndarray | Array
 ) -> Float[np.ndarray, " J"]:
-    """Probability that a predicate of a report is that of the truth, when truths occur as ``weights [S, A]``.
+    """Compute the probability that a predicate of an observation is that of the truth, under ``weights [S,
+    A]``.
 
-    ``predicates [J, S, A]`` may be labels. Exact, by summing over reports; ``weights`` need not be
-    normalised. This is what an estimated sensor is judged by: the reliabilities of :class:`FeatureNoise` are
+    ``predicates [J, S, A]`` may be labels. The sum over observations is exact; ``weights`` need not be
+    normalised. These probabilities judge an estimated sensor: the reliabilities of :class:`FeatureNoise` are
     parameters, not frequencies. Raises ``ValueError`` for noise without an observation model, bad predicates,
     or weights that are no distribution over its pairs.
     """
@@ -292,7 +319,7 @@ def agreement_probabilities(
 
 def _reading(noise: AnySensor) -> ObservationModel:
     if noise.noise is None:
-        raise ValueError("this imperfection has no observation model: it reports what is in view exactly")
+        raise ValueError("this sensor has no observation model: it observes the steps in view exactly")
     return noise.noise
 
 
@@ -301,14 +328,14 @@ def _reading(noise: AnySensor) -> ObservationModel:
 
 @shown_briefly
 class NoisyDemonstration(NamedTuple):
-    """What an expert did and what perception reported of it.
+    """Expert's behaviour and its observation by perception.
 
     Fields
     ------
     truth : Demonstration
         Every pair as it was; for judging only.
     seen : Demonstration
-        The reports, with scores if any were asked for.
+        The observations, with scores if requested.
     mdp : TabularMDP
         The task's process with the start that was simulated.
     """
@@ -328,30 +355,30 @@ def demonstrate_noisy(
     steps: int = 3,
     starts: Starts = "all",
     scores: Scores | None = None,
-    view: Visibility | None = None,
+    visibility: Visibility | None = None,
     concentration: float = CONCENTRATION,
     reliabilities: np.ndarray | None = None,
 ) -> NoisyDemonstration:
-    """Simulate the task's optimal expert and report it through ``noise`` (by default the task's own).
+    """Simulate the task's optimal expert and observe it through ``noise`` (by default the task's own).
 
     Session ``i`` is ``trajectories`` rows of ``steps`` pairs (``seen.sessions(trajectories)``); section
-    7.4.3 has two of three. Every trajectory starts afresh. ``view`` hides steps as well. Scores are
+    7.4.3 has two of three. Every trajectory starts afresh. ``visibility`` hides steps as well. Scores are
 
-    - ``"calibrated"``, the perception's probability of having made no mistake. At every step each swap of the
+    - ``"calibrated"``, the perception's probability that it made no error. At every step each swap of the
       noise has a clarity ``u ~ Beta`` of mean one minus its noise and ``alpha + beta = concentration``, and
-      happens with probability ``1 - u``; the score is the probability that none did. Swaps with nothing to
-      confuse are not asked, so that the score of a pair that is never mistaken is one. Other noise has one
-      clarity a step: under :class:`FeatureNoise` the score is the probability that every predicate is
-      reported rightly, under a plain observation model that the pair is. Summed over clarities, reports
-      follow the observation model exactly.
-    - ``"product"``, Eq. 6.5 for the report that occurred: ``p_j`` for predicates it has right times
-      ``1 - p_j`` for those it has wrong, with the given ``reliabilities [J]``; by default those of a
-      :class:`FeatureNoise`, otherwise the agreement probabilities among the expert's pairs. It is no
-      probability that the report is right, and takes knowledge of the truth that no perception has.
+      happens with probability ``1 - u``; the score is the probability that none did. Swaps that do not apply
+      do not count, so the score of a pair that is always observed correctly is one. Other noise has one
+      clarity a step: with :class:`FeatureNoise` the score is the probability that every predicate is right,
+      with a plain observation model that the pair is. Summed over clarities, observations follow the
+      observation model exactly.
+    - ``"product"``, Eq. 6.5 for the observation that occurred: ``p_j`` for predicates it has right times ``1
+      - p_j`` for those it has wrong, with the given ``reliabilities [J]``; by default those of a
+      :class:`FeatureNoise`, otherwise the agreement probabilities among the expert's pairs. It differs from
+      the probability that the observation is right, and requires the truth.
     - None: no scores.
 
     Raises ``ValueError`` for other words, sizes below one, a concentration or reliabilities that are none,
-    and noise or a view for another number of states or actions.
+    and noise or visibility for another number of states or actions.
     """
     if min(sessions, trajectories, steps) < 1:
         raise ValueError(
@@ -363,10 +390,10 @@ def demonstrate_noisy(
         raise ValueError(f"the concentration of the clarity must be positive, got {concentration}")
     noise = task.noise if noise is None else noise
     mdp, model = task.starting(starts), _reading(noise)
-    visibility = noise.visibility
-    if view is not None:
-        visibility = view.visibility if visibility is None else visibility * view.visibility
-    sensor = fitting_sensor(Sensor(visibility, model), mdp)
+    hidden = noise.visibility
+    if visibility is not None:
+        hidden = visibility.visibility if hidden is None else hidden * visibility.visibility
+    sensor = fitting_sensor(Sensor(hidden, model), mdp)
     if scores == "product":
         if reliabilities is None:
             reliabilities = (
@@ -377,12 +404,14 @@ def demonstrate_noisy(
         p = np.asarray(reliabilities, float)
         if p.shape != (len(task.predicates),) or not ((p >= 0) & (p <= 1)).all():
             raise ValueError(f"reliabilities are {len(task.predicates)} probabilities, got {reliabilities}")
-    walk, look, judge = jax.random.split(key, 3)
+    walk, perceive, judge = jax.random.split(key, 3)
     rows = sessions * trajectories
     with np.errstate(divide="ignore"):
         log_policy = jnp.asarray(np.log(task.expert_policy))
     states, actions = _walks(jax.random.split(walk, rows), mdp, log_policy, steps)
-    seen = Demonstration.from_codes(np.asarray(_looks(jax.random.split(look, rows), sensor, states, actions)))
+    seen = Demonstration.from_codes(
+        np.asarray(_looks(jax.random.split(perceive, rows), sensor, states, actions))
+    )
     truth = Demonstration.from_pairs(np.asarray(states), np.asarray(actions))
     if scores is not None:
         g = truth.state * mdp.n_actions + truth.action
@@ -407,11 +436,11 @@ def _clarity(
     key: Array,
     noise: AnySensor,
     truth: Int[np.ndarray, "n L"],
-    report: Int[np.ndarray, "n L"],
+    observation: Int[np.ndarray, "n L"],
     concentration: float,
 ) -> Float[np.ndarray, "n L"]:
     """Scores given what happened: the clarity's distribution once it is known whether a swap happened."""
-    g, o = truth.reshape(-1), report.reshape(-1)
+    g, o = truth.reshape(-1), observation.reshape(-1)
     if isinstance(noise, SwapNoise):
         wrong = np.asarray(noise.confused(jnp.asarray(g), jnp.asarray(o)))
         acts = np.asarray(noise.acts).reshape(len(noise.chances), -1).T
@@ -427,7 +456,8 @@ def _clarity(
     certain = (chance <= 0) | (chance >= 1)
     mean = 1 - np.where(certain, 0.5, chance)
     draws = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-    # Beta is conjugate to whether the swap happened, so the report may be drawn first, by the model itself.
+    # Beta is conjugate to whether the swap happened, so the observation may be drawn first, by the model
+    # itself.
     clarity = draws.beta(concentration * mean + ~wrong, concentration * (1 - mean) + wrong)
     return np.where(certain, 1 - chance, clarity).prod(axis=1).reshape(truth.shape)
 
@@ -436,7 +466,7 @@ def _product(
     predicates: Bool[np.ndarray, "J S A"],
     reliabilities: Float[np.ndarray, " J"],
     truth: Int[np.ndarray, "n L"],
-    report: Int[np.ndarray, "n L"],
+    observation: Int[np.ndarray, "n L"],
 ) -> Float[np.ndarray, "n L"]:
     psi, p = predicates.reshape(len(predicates), -1), reliabilities[:, None, None]
-    return np.where(psi[:, truth] == psi[:, report], p, 1 - p).prod(axis=0)
+    return np.where(psi[:, truth] == psi[:, observation], p, 1 - p).prod(axis=0)

@@ -22,7 +22,7 @@ from .process import ObjectWorld
 
 
 def object_world_scene(world: ObjectWorld) -> Scene:
-    """The grid with its walls, the two objects as stars, and the agent."""
+    """Draw the grid with its walls, the two objects as stars, and the agent."""
     rows, columns = world.walls.shape
     pixels = max(16, 420 / max(rows, columns))
     axes = new_canvas(-1.3, columns, rows, -1.3 - 18 / pixels, pixels, caption=48 / pixels)

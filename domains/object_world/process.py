@@ -1,10 +1,10 @@
 """Object World (Levine, Popović and Koltun, NIPS 2011) as in chapter 5: a walled grid with two objects.
 
 Table 5.1's world has 10 x 10 cells, a desirable object in each of two corners, and walls at random. The
-dissertation gives neither the number of walls nor the reward; both are parameters here. Cells are
-``(row, column)``, rows grow southward. A move leads to the neighbouring cell, or nowhere if a wall or the
-edge is in the way: moving against a wall is one more way of staying. :func:`without_blocked_moves` is the
-same world where it is no action at all.
+dissertation gives neither the number of walls nor the reward; both are parameters here. Cells are ``(row,
+column)``, rows grow southward. A move leads to the neighbouring cell, or nowhere if a wall or the edge is in
+the way: moving against a wall is one more action that stays. :func:`without_blocked_moves` is the same world
+where it is no action at all.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ _MOST_DRAWS = 10_000
 
 @shown_briefly
 class ObjectWorld(NamedTuple):
-    """A walled grid and what is desired in it.
+    """Walled grid with two objects and a reward.
 
     Fields
     ------
@@ -40,9 +40,9 @@ class ObjectWorld(NamedTuple):
         A state for every free cell, in reading order, named like ``(3,4)``. The features of a pair say
         whether the cell it is taken in holds the first or the second object, and whether it leads elsewhere.
     walls : bool ``[rows, columns]``
-        Cells nobody can enter.
+        Cells that block movement.
     objects : tuple of two cells
-        Where the first and the second object lie.
+        Cells of the first and the second object.
     weights : float ``[3]``
         The reward that makes them desirable.
     cells : tuple of cells
@@ -63,7 +63,7 @@ class ObjectWorld(NamedTuple):
         return Layout.grid(self.cells, marks=marks)
 
     def state_of(self, cell: Cell) -> int:
-        """The state of a free cell. Raises ``ValueError`` for a wall and outside the grid."""
+        """Return the state of a free cell. Raises ``ValueError`` for a wall and outside the grid."""
         cell = (int(cell[0]), int(cell[1]))
         if cell not in self.cells:
             raise ValueError(f"cell {cell} is no free cell of this {_size(self.walls)} world")
@@ -118,7 +118,7 @@ def walled_world(
     slip: float = 0.0,
     discount: float = 0.99,
 ) -> ObjectWorld:
-    """The world with these walls and objects.
+    """Build the world with these walls and objects.
 
     ``weights`` are of being at the first object, being at the second, and moving. With probability ``slip``
     a move goes in one of the four directions at random; staying never slips. The first cell is drawn
@@ -176,7 +176,7 @@ def _decision_process(
 
 
 def without_blocked_moves(world: ObjectWorld) -> ObjectWorld:
-    """The same world where a move against a wall or the edge is no action: cells differ in their choices."""
+    """Remove the actions that run into a wall or the edge, so that cells differ in their choices."""
     mdp = world.mdp
     open_way = np.asarray(mdp.features)[..., -1] > 0
     open_way[:, STAY] = True

@@ -1,8 +1,9 @@
-"""Breaching a patrol (section 7.1.1): where the patrollers will be, and a way to the goal they do not see.
+"""Breaching a patrol (section 7.1.1): a forecast of the patrollers, and a path to the goal out of their
+sight.
 
-The learner keeps a belief about where each patroller is, predicts where they will be under the policies it
-learned, and plans a way to the goal. What the dissertation leaves open (rewards, horizon, start) follows the
-reconstruction that :class:`BreachSettings` states. Runs of the whole task: :mod:`i2rl.domains.patrol.trials`.
+The learner tracks each patroller by a belief, predicts its places with the learned policies, and plans a path
+to the goal. :class:`BreachSettings` reconstructs the details that the dissertation leaves open (rewards,
+horizon, start). Trials of the whole task: :mod:`i2rl.domains.patrol.trials`.
 
 A patroller sees the cells within ``reach`` (Euclidean) straight ahead of it, its own included; walls do not
 matter, as in the released code.
@@ -79,7 +80,7 @@ class BreachPlan(NamedTuple):
 
 
 def line_of_sight(patrol: Patrol, reach: float) -> Bool[np.ndarray, "C S"]:
-    """Which patroller states see which of the learner's cells."""
+    """Find the cells of the learner that are in sight of each patroller state."""
     breach = _breach_of(patrol)
     down, right = (
         np.array(breach.cells)[:, axis, None] - np.array([state.cell[axis] for state in patrol.states])
@@ -89,14 +90,16 @@ def line_of_sight(patrol: Patrol, reach: float) -> Bool[np.ndarray, "C S"]:
     east, north, west, south = (heading == h for h in range(4))
     row, column = down == 0, right == 0
     ahead = (
-        (east & row & (right >= 0)) | (west & row & (right <= 0))
-        | (north & column & (down <= 0)) | (south & column & (down >= 0))
-    )  # fmt: skip
+        (east & row & (right >= 0))
+        | (west & row & (right <= 0))
+        | (north & column & (down <= 0))
+        | (south & column & (down >= 0))
+    )
     return ahead & (np.hypot(down, right) <= reach)
 
 
 def breach_task(patrol: Patrol, reach: float = 3.0) -> BreachTask:
-    """The learner's process on a patrol's map; ``ValueError`` for an instance without such a task."""
+    """Build the learner's process on a patrol's map; ``ValueError`` for an instance without such a task."""
     breach = _breach_of(patrol)
     index = {cell: i for i, cell in enumerate(breach.cells)}
     states = [breach.start._replace(row=r, column=c, heading=h) for r, c in breach.cells for h in range(4)]
@@ -132,11 +135,12 @@ def watch(
     belief: Float[Array, " S"],
     code: Int[Array, " 3"],
 ) -> Float[Array, " S"]:
-    """One step of the exact filter: the belief about the next state after perceiving ``code`` of this one.
+    """Update the belief: the distribution of the next state after the observation ``code`` of this one
+    (exact).
 
-    ``code`` is (kind, state, action) as in :attr:`Demonstration.codes`. Not being seen counts as evidence.
-    What policy and belief rule out, perception overrules: after a pair seen, the belief is the dynamics' own;
-    after a hidden step that was believed impossible, it starts afresh from anywhere out of view.
+    ``code`` is (kind, state, action) as in :attr:`Demonstration.codes`. Not being seen counts as evidence. An
+    observation overrules policy and belief: after a pair seen, the belief is that of the dynamics; after a
+    hidden step that was believed impossible, it starts afresh from anywhere out of view.
     """
     kind, state, action = code[0], code[1], code[2]
     no_score = jnp.array(jnp.nan)
@@ -155,7 +159,8 @@ def project(
     belief: Float[Array, " S"],
     code: Int[Array, " 3"],
 ) -> Float[Array, " S"]:
-    """The dissertation's belief: propagation from the last sighting, as if nobody had looked since.
+    """Propagate the belief from the last sighting, without the evidence of later hidden steps (the
+    dissertation's).
 
     As :func:`watch`, but a hidden step is taken for a lost frame.
     """
@@ -224,7 +229,7 @@ class SimulatedForecast(NamedTuple):
         beliefs: Float[Array, "P S"],
         horizon: int,
     ) -> Float[Array, "P T S"]:
-        """As for :class:`IndependentForecast`, from ``draws`` walks that start from the beliefs."""
+        """Forecast as :class:`IndependentForecast`, from ``draws`` walks that start from the beliefs."""
         equilibrium, length = self.interaction
 
         def one(key: Array) -> Int[Array, "P T"]:
@@ -250,11 +255,11 @@ def detection_probability(sees: Float[Array, "C S"], marginals: Float[Array, "P 
 
 
 def plan_breach(task: BreachTask, detection: Float[Array, "T C"], settings: BreachSettings) -> BreachPlan:
-    """Optimal plan against predicted patrollers, exact by one backward sweep.
+    """Compute the optimal plan against predicted patrollers, exactly, by one backward recursion.
 
     At each step the learner is first detected, with the probability ``detection [T, C]`` gives for its cell
-    (it is caught and pays the penalty), and otherwise moves. A goal ends the run and pays the reward; the
-    last step pays nothing.
+    (it is caught and pays the penalty), and otherwise moves. A goal ends the trial and pays the reward; the
+    last step pays zero.
     """
     goal_value = jnp.where(task.goal, settings.reward, 0.0)
 

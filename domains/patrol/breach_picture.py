@@ -25,8 +25,11 @@ class BreachScene:
         assert patrol.breach is not None
         self._patrol, self._states, self._sees = patrol, states, sees
         marks = [
-            (">", WATER, "learner"), (">", AGENT, "patroller"), ("s", GOAL, "goal"), ("s", SEEN, "seen"),
-        ]  # fmt: skip
+            (">", WATER, "learner"),
+            (">", AGENT, "patroller"),
+            ("s", GOAL, "goal"),
+            ("s", SEEN, "seen"),
+        ]
         axes, self._columns = draw_floor(patrol.breach.cells, marks, lines=2)
         goals = [outline(axes) for _ in patrol.breach.goals]
         for frame, (row, column) in zip(goals, patrol.breach.goals, strict=True):
@@ -47,7 +50,7 @@ class BreachScene:
     def frame(
         self, learner: int, patrollers: Int[np.ndarray, " P"], gone: bool, caption: str
     ) -> UInt8[np.ndarray, "height width 3"]:
-        """The picture; a learner that has not ``gone`` yet is pale, since it is hidden."""
+        """Draw the breach; the learner is pale until it has ``gone``, since it is hidden."""
         self._learner.stand(self._states[learner])
         self._learner.artist.set_alpha(1.0 if gone else 0.4)
         for walker, state in zip(self._walkers, patrollers, strict=True):

@@ -1,4 +1,4 @@
-"""The breach past the patrollers as a Gymnasium environment: wait for a good moment, then go unseen.
+"""Breach past the patrollers as a Gymnasium environment: wait for a good moment, then leave undetected.
 
 The process of :func:`i2rl.domains.patrol.trials` with the learner's moves left to the caller. Patrollers
 follow their optimal policies and pass each other as :class:`Interaction` says.
@@ -29,10 +29,10 @@ WAIT = ACTIONS.index("wait")
 class BreachEnv(gymnasium.Env[np.ndarray, int]):
     """The learner's task against patrollers that walk.
 
-    An observation is ``[1 + P]``: the learner's state, and of each patroller its state or, where it is out of
-    view, the number of patrol states. Actions are forward, left, right and wait. The learner stays hidden
-    while it waits and may not wait any more once it has left: ``info["action_mask"]`` (int8, ``[4]``) says
-    so, and waiting then is an action that changes nothing of the learner while time goes on.
+    An observation is ``[1 + P]``: the learner's state, and each patroller's state; a patroller out of view
+    has the number of patrol states. Actions are forward, left, right and wait. The learner stays hidden while
+    it waits and may not wait any more once it has left: ``info["action_mask"]`` (int8, ``[4]``) says so;
+    waiting then leaves the learner as it is while time passes.
 
     An episode terminates at a goal (``settings.reward``) or when a patroller sees the learner
     (``-settings.penalty``), also at the start as it leaves; ``info["ended"]`` then says which. With
@@ -43,8 +43,8 @@ class BreachEnv(gymnasium.Env[np.ndarray, int]):
     patrol : Patrol
         Instance 2 or 3.
     observability : int
-        Percent of the patrollers' states in view, as in ``patrol.views``; at 100 it is a Markov process but
-        for meetings of more than one step.
+        Percent of the patrollers' states in view, as in ``patrol.views``; at 100 it is a Markov process
+        except in meetings of more than one step.
     interaction : Interaction
     settings : BreachSettings
         ``horizon`` and ``rounds`` are not used: Gymnasium's limit of steps ends an episode that takes long.
@@ -75,8 +75,11 @@ class BreachEnv(gymnasium.Env[np.ndarray, int]):
         task = breach_task(patrol, settings.reach)
         assert patrol.breach is not None  # or there were no task
         self.patrol, self.interaction, self.settings, self.render_mode = (
-            patrol, interaction, settings, render_mode,
-        )  # fmt: skip
+            patrol,
+            interaction,
+            settings,
+            render_mode,
+        )
         self.states = tuple(State(r, c, h) for r, c in patrol.breach.cells for h in range(len(HEADINGS)))
         patrol.visibility(observability)  # refuses a view that is not there
         self._seen = patrol.views[observability]
@@ -107,7 +110,7 @@ class BreachEnv(gymnasium.Env[np.ndarray, int]):
         given = dict(options or {})
         patrollers = given.pop("patrollers", None)
         if given:
-            raise ValueError(f"reset knows the option 'patrollers' only, got {', '.join(map(repr, given))}")
+            raise ValueError(f"reset takes only the option 'patrollers', got {', '.join(map(repr, given))}")
         self._patrollers = (
             np.array([drawn(self._initial, self.np_random.random()) for _ in range(self.patrol.patrollers)])
             if patrollers is None
@@ -137,7 +140,7 @@ class BreachEnv(gymnasium.Env[np.ndarray, int]):
         first reset and after the end.
         """
         if self._patrollers is None or self._ended >= 0:
-            raise gymnasium.error.ResetNeeded("reset the environment first: no episode is under way")
+            raise gymnasium.error.ResetNeeded("reset the environment first: no episode has begun")
         if not self.action_space.contains(action):
             raise ValueError(f"actions are 0 to {len(ACTIONS) - 1}, got {action!r}")
         # Who leaves may be seen at once, and has not moved then.
@@ -196,7 +199,7 @@ class BreachEnv(gymnasium.Env[np.ndarray, int]):
         return {"action_mask": mask, "ended": OUTCOMES[self._ended] if self._ended >= 0 else ""}
 
     def render(self) -> UInt8[np.ndarray, "height width 3"] | str | None:
-        """A picture (``rgb_array``) or its caption alone (``ansi``); None without a render mode.
+        """Return a picture (``rgb_array``), its caption alone (``ansi``), or None without a render mode.
 
         Everybody is shown, also who is out of the learner's view.
         """
@@ -214,7 +217,7 @@ class BreachEnv(gymnasium.Env[np.ndarray, int]):
         return self._scene.frame(self._state, self._patrollers, self._gone, self.caption())
 
     def caption(self) -> str:
-        """The last action and its reward, and where the learner is or how it ended."""
+        """Write the last action and its reward, and the learner's place or the trial's end."""
         last = "begins" if self._last is None else f"{ACTIONS[self._last[0]]}, reward {self._last[1]:.3g}"
         how = OUTCOMES[self._ended] if self._ended >= 0 else "on its way" if self._gone else "hidden"
         return f"{last}\n{self.states[self._state].name}: {how}"

@@ -24,7 +24,7 @@ from .process import Patrol, State
 
 
 def patrol_scene(patrol: Patrol) -> Scene:
-    """The floor with a patroller that points where it heads; instance 1 marks the hallway end it seeks."""
+    """Draw the floor with a patroller in its heading; instance 1 marks the hallway end it seeks."""
     ends = _hallway_ends(patrol)
     marks = [(">", AGENT, "patroller"), *([("s", GOAL, "end it seeks")] if ends else [])]
     axes, columns = draw_floor(patrol.cells, marks)
@@ -64,14 +64,14 @@ def draw_floor(
 
 
 def outline(axes: Axes) -> Rectangle:
-    """The frame of a cell that is sought; its lower corner is for the caller to set."""
+    """Make the frame of a goal cell; the caller sets its lower corner."""
     frame = Rectangle((0, 0), 0.86, 0.86, facecolor="none", edgecolor=GOAL, linewidth=2.2, zorder=3)
     axes.add_patch(frame)
     return frame
 
 
 class Walker:
-    """An arrowhead on a floor that points where somebody heads."""
+    """Arrowhead on a floor that points in the direction of movement."""
 
     def __init__(self, axes: Axes, color: str):
         self.artist = Polygon(np.zeros((4, 2)), facecolor=color, edgecolor=INK, linewidth=1.0, zorder=4)
@@ -89,7 +89,7 @@ _ARROWHEAD = np.array([(0.42, 0.0), (-0.32, 0.3), (-0.16, 0.0), (-0.32, -0.3)])
 
 
 def _hallway_ends(patrol: Patrol) -> dict[int, tuple[int, int]]:
-    """Instance 1: the cell where each phase becomes the next; nothing elsewhere."""
+    """Find the cell where each phase becomes the next in instance 1; None elsewhere."""
     successors = np.asarray(patrol.mdp.successors)[..., 0]
     return {
         here.phase: patrol.states[following].cell

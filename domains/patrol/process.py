@@ -59,7 +59,7 @@ class State(NamedTuple):
 
 @shown_briefly
 class Breach(NamedTuple):
-    """Where the learner starts, which way it faces, where it wants to go, and the cells it may use."""
+    """Breach of a patrol: the learner's start and heading, its goal, and the cells it may use."""
 
     cells: tuple[Cell, ...]
     start: State
@@ -89,7 +89,7 @@ class Patrol(NamedTuple):
 
     @property
     def cells(self) -> tuple[Cell, ...]:
-        """The cells patrollers can stand on, in reading order."""
+        """Cells of the patrollers, row by row."""
         return tuple(sorted({state.cell for state in self.states}))
 
     @property
@@ -119,7 +119,7 @@ class Patrol(NamedTuple):
         )
 
     def visibility(self, observability: int | None = None) -> Visibility:
-        """The learner's view at an observability named by the dissertation (30, 70, 100 percent, ...).
+        """Return the visibility at an observability that the dissertation names (30, 70, 100 percent, ...).
 
         The default is the instance's own. Raises ``ValueError`` naming the degrees this instance has.
         """
@@ -130,12 +130,12 @@ class Patrol(NamedTuple):
         return Visibility(self.views[observability])
 
     def expert_policy(self) -> Float[np.ndarray, "S A"]:
-        """The patrollers' optimal policy; ties go right before left, as in the released code."""
+        """Compute the patrollers' optimal policy; ties go right before left, as in the released code."""
         return greedy_policy(self.mdp, self.weights)
 
 
 def greedy_policy(mdp: TabularMDP, weights: Float[np.ndarray, " K"]) -> Float[np.ndarray, "S A"]:
-    """The deterministic policy that is optimal under some weights, ties broken by :func:`break_ties`."""
+    """Compute the deterministic optimal policy under some weights, ties broken by :func:`break_ties`."""
     return break_ties(np.asarray(_optimal(mdp, jnp.asarray(weights, float))))
 
 
@@ -152,7 +152,7 @@ def break_ties(optimal: Bool[np.ndarray, "S A"]) -> Float[np.ndarray, "S A"]:
 
 
 class Interaction(NamedTuple):
-    """What two patrollers do when they meet: an equilibrium of the passing game, played for some steps.
+    """Meeting of two patrollers: an equilibrium of the passing game, played for some steps.
 
     ``equilibrium`` holds each patroller's action; forward means to follow its own policy. In the steps
     before the last of ``length`` both wait. ``length`` 0 means they pass through each other.
@@ -177,9 +177,15 @@ def simulate_patrol(
     """
     cells = jnp.asarray(patrol.cell_of_state)
     return simulate_patrollers(
-        key, patrol.mdp, cells, jnp.asarray(log_policies), jnp.asarray(start), interaction.equilibrium,
-        interaction.length, steps,
-    )  # fmt: skip
+        key,
+        patrol.mdp,
+        cells,
+        jnp.asarray(log_policies),
+        jnp.asarray(start),
+        interaction.equilibrium,
+        interaction.length,
+        steps,
+    )
 
 
 @partial(jax.jit, static_argnums=(5, 6, 7))
@@ -229,7 +235,7 @@ def demonstrate(
     steps: int = 5,
     interaction: Interaction = Interaction(),  # noqa: B008 (immutable)
 ) -> tuple[Demonstration, ...]:
-    """What the learner perceives of each patroller: ``sessions`` consecutive windows of ``steps`` pairs.
+    """Simulate the learner's observation of each patroller: ``sessions`` windows of ``steps`` pairs in a row.
 
     The patrollers start in states drawn from the MDP's initial distribution and follow their optimal
     policies. Row ``i`` of each demonstration is session ``i`` (section 7.4.1: five pairs a session). An
@@ -350,11 +356,19 @@ def four_hallways() -> Patrol:
         return tuple(target.phase == k != state.phase for k in range(1, 5))
 
     return _build(
-        "patrol1", states, intend, features, tuple(f"switch to hallway {k}" for k in range(1, 5)),
-        (0.25, 0.25, 0.25, 0.25), success=0.99, discount=0.995, patrollers=1,
+        "patrol1",
+        states,
+        intend,
+        features,
+        tuple(f"switch to hallway {k}" for k in range(1, 5)),
+        (0.25, 0.25, 0.25, 0.25),
+        success=0.99,
+        discount=0.995,
+        patrollers=1,
         views={30: lambda s: s.column == 4 and s.row >= 3, 44: lambda s: s.column == 4, 100: lambda s: True},
-        breach=None, loop=64,
-    )  # fmt: skip
+        breach=None,
+        loop=64,
+    )
 
 
 @cache
@@ -390,12 +404,26 @@ def boyd_fifth_floor() -> Patrol:
         100: lambda s: True,
     }
     return _build(
-        "patrol2", _grid_states(cells), _walk(cells), features,
-        ("moves", "turns in hallway", "turns at corner", "turns in division 1", "turns in division 2",
-         "turns in division 3"),
-        (4 / 7, 0, 0, 0, 3 / 7, 0), success=0.95, discount=0.99, patrollers=2, views=views,
-        breach=Breach(tuple(sorted(cells | {(0, 0)})), State(0, 0, 0), ((9, 1),), 0.99), loop=56,
-    )  # fmt: skip
+        "patrol2",
+        _grid_states(cells),
+        _walk(cells),
+        features,
+        (
+            "moves",
+            "turns in hallway",
+            "turns at corner",
+            "turns in division 1",
+            "turns in division 2",
+            "turns in division 3",
+        ),
+        (4 / 7, 0, 0, 0, 3 / 7, 0),
+        success=0.95,
+        discount=0.99,
+        patrollers=2,
+        views=views,
+        breach=Breach(tuple(sorted(cells | {(0, 0)})), State(0, 0, 0), ((9, 1),), 0.99),
+        loop=56,
+    )
 
 
 @cache
@@ -432,25 +460,44 @@ def boyd_with_rooms() -> Patrol:
     k2 = [*k1, lambda r, c: r == 0 and c >= 10]
     k4 = [*k2, lambda r, c: r <= 1 and c >= 10, lambda r, c: r <= 6 and c in (15, 16)]
     k6 = [
-        *k4, lambda r, c: r == 0 and c >= 8, lambda r, c: r == 2 and c >= 9, lambda r, c: r == 5 and c >= 14,
+        *k4,
+        lambda r, c: r == 0 and c >= 8,
+        lambda r, c: r == 2 and c >= 9,
+        lambda r, c: r == 5 and c >= 14,
         lambda r, c: r <= 7 and c == 16,
-    ]  # fmt: skip
+    ]
     k10 = [
-        *k6, lambda r, c: r == 0 and c >= 6, lambda r, c: r <= 4 and c >= 10, lambda r, c: r == 5 and c >= 12,
-        lambda r, c: r <= 7 and c >= 14, lambda r, c: r <= 11 and c >= 15,
-    ]  # fmt: skip
+        *k6,
+        lambda r, c: r == 0 and c >= 6,
+        lambda r, c: r <= 4 and c >= 10,
+        lambda r, c: r == 5 and c >= 12,
+        lambda r, c: r <= 7 and c >= 14,
+        lambda r, c: r <= 11 and c >= 15,
+    ]
     return _build(
-        "patrol3", _grid_states(cells), _walk(cells), features,
+        "patrol3",
+        _grid_states(cells),
+        _walk(cells),
+        features,
         ("moves", "in a room", "turns left in hallway", "enters a room", "leaves a room"),
-        (1.0, -1.0, 0.1, 0.0, 0.0), success=0.99, discount=0.99, patrollers=2,
+        (1.0, -1.0, 0.1, 0.0, 0.0),
+        success=0.99,
+        discount=0.99,
+        patrollers=2,
         views={
-            9: view(*k1), 18: view(*k2), 33: view(*k4), 46: view(*k6), 65: view(*k10), 100: lambda s: True
+            9: view(*k1),
+            18: view(*k2),
+            33: view(*k4),
+            46: view(*k6),
+            65: view(*k10),
+            100: lambda s: True,
         },
         breach=Breach(
             tuple(sorted(cells | {(0, 17), (1, 0), (13, 13)})), State(0, 17, 2), ((1, 0), (13, 13)), 0.95
         ),
-        loop=64, observability=18,
-    )  # fmt: skip
+        loop=64,
+        observability=18,
+    )
 
 
 def instance(number: int) -> Patrol:

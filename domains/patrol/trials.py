@@ -1,6 +1,6 @@
 """Runs of the breach (section 7.4.1): watch, learn, wait for a good moment, and go.
 
-Success and time-out rates of the dissertation's figures 7.4 and 7.7 are shares of such runs.
+Success and time-out rates of the dissertation's figures 7.4 and 7.7 are shares of such trials.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ OUTCOMES = ("reached", "caught", "timed out", "ran out")
 
 
 class GoAtBestTime(NamedTuple):
-    """The dissertation's rule: once some departure is worth more than nothing, settle on the best one."""
+    """Dissertation's rule: once some departure has positive value, settle on the best one."""
 
     def __call__(
         self, key: Array, waited: Int[Array, ""], left: Int[Array, ""], values: Float[Array, " T"]
     ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-        """Whether to settle now, and on which step.
+        """Decide whether to settle now, and on which step.
 
         ``waited`` and ``left`` are the steps waited so far and still allowed, ``values`` the plan's at the
         start for each departure (``-inf`` beyond what is allowed).
@@ -56,16 +56,16 @@ class GoAtBestTime(NamedTuple):
 
 
 class GoWhenBest(NamedTuple):
-    """Watch on, plan afresh at every step, and go when no later departure is worth more (the default).
+    """Default rule: plan afresh at every step, and go once no later departure is worth more.
 
-    What is seen meanwhile corrects the forecast. On instance 2 at 30 % it reaches the goal in about nine runs
-    of ten where :class:`GoAtBestTime` does in three of four.
+    Observations during the wait correct the forecast. On instance 2 at 30 % it reaches the goal in about nine
+    trials of ten, :class:`GoAtBestTime` in three of four.
     """
 
     def __call__(
         self, key: Array, waited: Int[Array, ""], left: Int[Array, ""], values: Float[Array, " T"]
     ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-        """As for :class:`GoAtBestTime`."""
+        """Decide as :class:`GoAtBestTime` does."""
         return (values[0] > 0) & (jnp.argmax(values) == 0), jnp.zeros((), int)
 
 
@@ -75,7 +75,7 @@ class GoAtRandom(NamedTuple):
     def __call__(
         self, key: Array, waited: Int[Array, ""], left: Int[Array, ""], values: Float[Array, " T"]
     ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-        """As for :class:`GoAtBestTime`; half of all runs time out."""
+        """Decide as :class:`GoAtBestTime` does; half of all trials time out."""
         return jax.random.randint(key, (), 0, 2 * (waited + left + 1)) == waited, jnp.zeros((), int)
 
 
@@ -87,7 +87,7 @@ GoRule = GoAtBestTime | GoWhenBest | GoAtRandom
 
 @shown_briefly
 class BreachOutcome(NamedTuple):
-    """How ``n`` runs ended.
+    """Outcomes of ``n`` trials.
 
     Fields
     ------
@@ -95,9 +95,9 @@ class BreachOutcome(NamedTuple):
         Index into ``OUTCOMES``: reached a goal unseen; caught; had not left when the time allowed was over;
         left, but the plan's horizon ran out.
     waited : float ``[n]``
-        Seconds between the end of learning and departure; NaN for runs that timed out.
+        Seconds between the end of learning and departure; NaN for trials that timed out.
     threshold : float
-        Seconds from the start of the run within which the learner had to leave.
+        Seconds from the start of the trial within which the learner had to leave.
     """
 
     ended: Int[np.ndarray, " n"]
@@ -105,7 +105,7 @@ class BreachOutcome(NamedTuple):
     threshold: float
 
     def rate(self, outcome: int = REACHED) -> float:
-        """Share of runs that ended so."""
+        """Return the share of trials that ended so."""
         return float(np.mean(self.ended == outcome))
 
     def interval(self, outcome: int = REACHED, level: float = 0.95) -> tuple[float, float]:
@@ -118,7 +118,7 @@ class BreachOutcome(NamedTuple):
 
     @property
     def mean_wait(self) -> float:
-        """Mean seconds waited by the runs that left; NaN if none did."""
+        """Mean seconds waited by the trials that left; NaN if none did."""
         gone = self.waited[~np.isnan(self.waited)]
         return float(gone.mean()) if len(gone) else math.nan
 
@@ -140,7 +140,7 @@ def breach_trials(
     forecast: Forecast = IndependentForecast(),  # noqa: B008 (immutable)
     go: GoRule = GoWhenBest(),  # noqa: B008 (immutable)
 ) -> BreachOutcome:
-    """Simulate runs: watch the patrol, learn, wait for a good moment, and try to reach the goal unseen.
+    """Simulate trials: watch the patrol, learn, wait for a good moment, and try to reach the goal undetected.
 
     The patrollers start anywhere, follow their true optimal policies and pass each other as ``interaction``
     says, all the while. The learner watches ``observed_steps`` steps, is blind while it learns, then watches
@@ -153,25 +153,25 @@ def breach_trials(
     patrol : Patrol
         Instance 2 or 3.
     log_policies : float ``[P, S, A]``
-        What the learner takes for the patrollers' policies, see :func:`greedy_policies`.
+        The patrollers' policies that the learner assumes, see :func:`greedy_policies`.
     observability : int
         Percent, as in ``patrol.views``.
     observed_steps : int
         Steps perceived before learning: sessions times five.
     trials : int
     learning_seconds : float or float ``[trials]``
-        How long learning takes; it is rounded up to steps of the patrol.
+        Duration of learning; it is rounded up to steps of the patrol.
     threshold_seconds : float, optional
-        The learner must leave within so many seconds from the start of the run. By default perception, mean
-        learning time and ``settings.rounds`` rounds of the patrol (section 7.4.1).
+        The learner must leave within so many seconds from the start of the trial. The default is perception,
+        mean learning time and ``settings.rounds`` rounds of the patrol (section 7.4.1).
     interaction : Interaction
-        What the patrollers really do when they meet.
+        True meetings of the patrollers.
     settings : BreachSettings
         The true task.
     planned_with : BreachSettings, optional
-        The task that the learner plans for, if it is another one (same horizon).
+        The task that the learner plans for, if it differs (same horizon).
     watcher : :func:`watch` or :func:`project`
-        How the belief about a patroller is kept.
+        Update of the belief about a patroller.
     forecast : IndependentForecast or SimulatedForecast
     go : GoAtBestTime, GoWhenBest or GoAtRandom
 
@@ -203,12 +203,27 @@ def breach_trials(
     length = 64 * math.ceil((max(deadline, observed_steps) + 1) / 64) + settings.horizon
     true_policy = jnp.log(jnp.asarray(patrol.expert_policy()))
     ended, waited = _trials(
-        jax.random.split(key, trials), jnp.asarray(ready), patrol.mdp, jnp.asarray(patrol.cell_of_state),
-        patrol.visibility(observability), jnp.broadcast_to(true_policy, expected), log_policies,
-        world, breach_task(patrol, believed.reach),
-        settings, believed, jnp.array(observed_steps), jnp.array(deadline),
-        settings.horizon, length, tuple(interaction.equilibrium), interaction.length, watcher, forecast, go,
-    )  # fmt: skip
+        jax.random.split(key, trials),
+        jnp.asarray(ready),
+        patrol.mdp,
+        jnp.asarray(patrol.cell_of_state),
+        patrol.visibility(observability),
+        jnp.broadcast_to(true_policy, expected),
+        log_policies,
+        world,
+        breach_task(patrol, believed.reach),
+        settings,
+        believed,
+        jnp.array(observed_steps),
+        jnp.array(deadline),
+        settings.horizon,
+        length,
+        tuple(interaction.equilibrium),
+        interaction.length,
+        watcher,
+        forecast,
+        go,
+    )
     return BreachOutcome(np.asarray(ended), np.asarray(waited), float(threshold))
 
 
@@ -334,6 +349,6 @@ def _soft(mdp: TabularMDP, weights: Float[Array, "P K"]) -> Float[Array, "P S A"
 
 
 def random_policies(key: Array, patrol: Patrol) -> Float[Array, "P S A"]:
-    """The dissertation's random baseline: greedy under weights uniform on (-0.99, 0.99)."""
+    """Draw the dissertation's random baseline: greedy policies under weights uniform on (-0.99, 0.99)."""
     shape = (patrol.patrollers, patrol.mdp.n_features)
     return greedy_policies(patrol, np.asarray(jax.random.uniform(key, shape, float, -0.99, 0.99)))

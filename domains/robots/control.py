@@ -75,7 +75,7 @@ def mountain_car(horizon: int = 200) -> Environment:
 
 
 def cart_pole_dynamics(states: ArrayLike, actions: ArrayLike) -> Float[Array, "... 4"]:
-    """The states ``[..., 4]`` after actions ``[...]``, by Euler's method."""
+    """Compute the states ``[..., 4]`` after actions ``[...]``, by Euler's method."""
     states = jnp.asarray(states)
     x, speed, angle, turning = (states[..., i] for i in range(4))
     force = jnp.where(jnp.asarray(actions) == 1, _FORCE, -_FORCE).astype(states.dtype)
@@ -97,7 +97,7 @@ def cart_pole_dynamics(states: ArrayLike, actions: ArrayLike) -> Float[Array, ".
 
 
 def mountain_car_dynamics(states: ArrayLike, actions: ArrayLike) -> Float[Array, "... 2"]:
-    """The states ``[..., 2]`` after actions ``[...]``; the left end stops the car."""
+    """Compute the states ``[..., 2]`` after actions ``[...]``; the left end stops the car."""
     states = jnp.asarray(states)
     position, velocity = states[..., 0], states[..., 1]
     thrust = (jnp.asarray(actions) - 1).astype(states.dtype) * _THRUST
@@ -109,7 +109,7 @@ def mountain_car_dynamics(states: ArrayLike, actions: ArrayLike) -> Float[Array,
 
 
 def at_flag(states: ArrayLike) -> Bool[Array, "..."]:
-    """Whether mountain-car states ``[..., 2]`` are at the flag or beyond it, and not rolling back."""
+    """Test whether mountain-car states ``[..., 2]`` are at the flag or beyond it, and not rolling back."""
     states = jnp.asarray(states)
     return (states[..., 0] >= _FLAG) & (states[..., 1] >= 0)
 

@@ -44,7 +44,7 @@ TARGETS = {"hopper": 2810.0, "walker2d": 2700.0, "half-cheetah": 2507.0, "mounta
 
 
 class Recipe(NamedTuple):
-    """How an expert is made.
+    """Training settings of an expert.
 
     Fields
     ------
@@ -101,7 +101,7 @@ class Demonstrations(NamedTuple):
 
     @property
     def recording(self) -> Recording:
-        """As learners take it."""
+        """Recording that learners take."""
         return recording(
             [o[:end] for o, end in zip(self.observations, self.lengths, strict=True)],
             [a[:end] for a, end in zip(self.actions, self.lengths, strict=True)],
@@ -110,7 +110,7 @@ class Demonstrations(NamedTuple):
 
 
 def expert_task(name: str) -> Task:
-    """The task an expert is recorded at: mountain car, or a robot at fixed length.
+    """Make the task on which an expert is recorded: mountain car, or a robot at fixed length.
 
     Raises ``ValueError`` for a name that is not in :data:`EXPERTS`.
     """
@@ -119,7 +119,7 @@ def expert_task(name: str) -> Task:
 
 
 def expert_agent(name: str, steps: int) -> PPO:
-    """The agent that learns to be the expert ``name``, its learning rate falling to zero over ``steps``.
+    """Make the agent that learns to be the expert ``name``; its learning rate falls to zero over ``steps``.
 
     A robot's episodes end when it falls, and mountain car's are longer than when recorded, or it would find
     the flag too rarely. Raises as :func:`expert_task`.
@@ -131,11 +131,11 @@ def expert_agent(name: str, steps: int) -> PPO:
 
 
 def train_expert(
-    name: str, key: Array, steps: int, report: Callable[[Training], None] | None = None
+    name: str, key: Array, steps: int, on_part: Callable[[Training], None] | None = None
 ) -> tuple[Policy, Training]:
-    """A policy trained for ``steps`` steps by the true reward, and how that went.
+    """Train a policy for ``steps`` steps by the true reward; return it and the course of the training.
 
-    ``report`` is called with each part of the training, every 50 rollouts. Raises as :func:`expert_task`.
+    ``on_part`` is called with each part of the training, every 50 rollouts. Raises as :func:`expert_task`.
     """
     agent = expert_agent(name, steps)
     state, parts, done = agent.init(key), list[Training](), 0
@@ -143,8 +143,8 @@ def train_expert(
         state, part = agent.train(state, min(50 * agent.settings.steps, steps - done))
         parts.append(part)
         done = int(part.steps[-1])
-        if report is not None:
-            report(part)
+        if on_part is not None:
+            on_part(part)
     return state.policy, Training(*(np.concatenate(column) for column in zip(*parts, strict=True)))
 
 
@@ -234,13 +234,13 @@ def make_expert(name: str) -> None:
     """Train, record and store one expert by its :class:`Recipe`, telling how it goes."""
     recipe, began = RECIPES[_known(name)], time.perf_counter()
 
-    def report(part: Training) -> None:
+    def on_part(part: Training) -> None:
         ended = part.returns[np.isfinite(part.returns)]
         shown = f"{ended.mean():.0f}" if len(ended) else "none ended"
         print(f"{name}: {part.steps[-1]} steps, return {shown}", flush=True)
 
     k_train, k_record = jax.random.split(jax.random.key(recipe.seed))
-    policy, training = train_expert(name, k_train, recipe.steps, report)
+    policy, training = train_expert(name, k_train, recipe.steps, on_part)
     demonstrations = demonstrate_expert(expert_task(name), policy, k_record, recipe.episodes)
     returns = demonstrations.returns
     settings = expert_agent(name, recipe.steps).settings._asdict()

@@ -1,8 +1,8 @@
-"""Recordings of somebody sorting onions, as files: reading those that were released, and writing our own.
+"""Recordings of a person who sorts onions, as files: reading of released recordings, and writing of ours.
 
 One pair of files a recording, comma-separated without a header. ``states_N.csv`` has 29 columns as in
-:mod:`i2rl.domains.robots.reaching`; ``actions_N.csv`` has 3, the wrist's displacement in metres, so
-that ``wrist[t + 1] - wrist[t]`` is ``action[t]``. Every state has an action, the last of which leads nowhere.
+:mod:`i2rl.domains.robots.reaching`; ``actions_N.csv`` has 3, the wrist's displacement in metres, so that
+``wrist[t + 1] - wrist[t]`` is ``action[t]``. Every state has an action; the last action has no successor.
 """
 
 from __future__ import annotations
@@ -24,7 +24,8 @@ _ROUNDED = 0.0151
 
 
 def read_onion_recordings(folder: Path | str, stride: float = STRIDE) -> Recording:
-    """All recordings of a folder, by number; each is one trajectory to its end, of actions over ``stride``.
+    """Read all recordings of a folder, by number; each is one trajectory to its end, of actions over
+    ``stride``.
 
     Raises :class:`~i2rl.models.observation.recordings.RecordingError` (a ``ValueError``) for a folder without
     any, and naming file, row and column (from 1) for: a row of another length, what is not a finite number, a
@@ -51,9 +52,9 @@ def read_onion_recordings(folder: Path | str, stride: float = STRIDE) -> Recordi
 def write_onion_recordings(
     folder: Path | str, trajectories: Trajectories, stride: float = STRIDE
 ) -> list[Path]:
-    """Write trajectories of the task in the same layout, two decimals; the paths of the states.
+    """Write trajectories of the task in the same layout, two decimals; return the paths of the states.
 
-    The state after the last step is the last row, with an action of nothing.
+    The state after the last step is the last row, with the action zero.
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

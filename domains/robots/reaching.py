@@ -1,13 +1,12 @@
-"""Sorting onions by moving a wrist through space: the continuous form of the onion line (section 7.4.3).
+"""Onion sorting by a wrist that moves through space: the continuous onion line (section 7.4.3).
 
 An arm reaches over a belt with five onions, brings each to the eyes, and drops it in a bin (blemished) or at
-the belt's end (unblemished). The rules (grasp distance, where the bin and the belt's end are, rewards, 400
+the belt's end (unblemished). The rules (grasp distance, places of the bin and the belt's end, rewards, 400
 steps) are those of the environment that the dissertation's authors released for three dimensions.
 
-The 64-dimensional recordings behind Table 7.5 were never released and can not be had, nor can most of the
-learned models of the arm that its simulator needed. This is the smaller successor, of 29 dimensions, for
-which ten recordings were released (:mod:`i2rl.domains.robots.onion_recordings`); Table 7.5 is **not**
-reproduced by it.
+The 64-dimensional recordings behind Table 7.5 were never released, nor were most of the learned models of the
+arm that its simulator needed. This is the smaller successor, of 29 dimensions, for which ten recordings were
+released (:mod:`i2rl.domains.robots.onion_recordings`); it does **not** reproduce Table 7.5.
 
 Two things are modelled rather than recorded:
 
@@ -15,9 +14,9 @@ Two things are modelled rather than recorded:
   toward what is out of reach; upper arm (0.30 m) and forearm (0.20 m, to where the wrist was tracked) are the
   recordings' median lengths; the elbow bends down, back and to the right. The authors used regressors that
   they fitted to their recordings.
-- *The hand.* It is where the wrist is: an onion within 0.05 m of the wrist is held, and goes where it goes.
-  In the recordings a held onion is 0.1 to 0.3 m from the wrist, so recorded actions, played here, grasp
-  nothing.
+- *The hand.* Its place is the wrist's: an onion within 0.05 m of the wrist is held and moves with it. In the
+  recordings a held onion is 0.1 to 0.3 m from the wrist, so recorded actions, replayed here, miss every
+  onion.
 """
 
 from __future__ import annotations
@@ -89,7 +88,7 @@ class Scene(NamedTuple):
 
 
 def scene(observations: Float[Array, "... 29"]) -> Scene:
-    """What an observation shows beside the arm."""
+    """Extract the scene of an observation: all of it but the arm."""
     things = observations[..., 9:].reshape(*observations.shape[:-1], ONIONS, 4)
     return Scene(observations[..., 6:9], things[..., :3], things[..., 3])
 
@@ -108,7 +107,7 @@ def arm(wrist: Float[Array, "... 3"]) -> tuple[Float[Array, "... 3"], Float[Arra
 
 
 def compose(seen: Scene) -> Float[Array, "... 29"]:
-    """The observation of a scene, the arm following from the wrist."""
+    """Compose the observation of a scene; the arm follows from the wrist."""
     things = jnp.concatenate([seen.onions, seen.labels[..., None]], -1)
     flat = things.reshape(*things.shape[:-2], 4 * ONIONS)
     return jnp.concatenate([*arm(seen.wrist), seen.wrist, flat], -1)
@@ -116,7 +115,7 @@ def compose(seen: Scene) -> Float[Array, "... 29"]:
 
 @shown_briefly
 class Outcome(NamedTuple):
-    """What a step came to: the next observation, its reward, and whether all onions are dealt with."""
+    """Outcome of a step: the next observation, its reward, and whether all onions are dealt with."""
 
     observation: Float[Array, "... 29"]
     reward: Float[Array, "..."]
@@ -150,10 +149,11 @@ def move(observations: Float[Array, "... 29"], actions: Array, stride: float = S
 
 @lru_cache
 def onion_reaching(stride: float = STRIDE, horizon: int = 400) -> Environment:
-    """The task: observations of 29 numbers in metres, actions of 3 in [-1, 1], in units of ``stride`` metres.
+    """Make the task: observations of 29 numbers in metres, actions of 3 in [-1, 1], in units of ``stride``
+    metres.
 
-    First states are drawn: five onions on the belt, each blemished or not with equal chances. The episode
-    terminates when all are dealt with. What is held follows from the observation, which thus is the state.
+    First states are drawn: five onions on the belt, each blemished with probability one half. The episode
+    terminates when all are dealt with. The observation determines the onion in hand, so it is the state.
     Raises ``ValueError`` for a stride that is not positive.
     """
     if not stride > 0:
@@ -221,11 +221,11 @@ _LONGEST = 0.45
 
 @shown_briefly
 class OnionMover(NamedTuple):
-    """Sorts without an error, by the observation alone, somewhat as the recorded person does.
+    """Scripted expert that sorts without error from the observation alone, much as the recorded person does.
 
-    The hand hovers over the next onion along the belt, comes down on it, brings it up to be looked at, and
-    takes it to where it belongs. Drawn actions wobble before the eyes for about ten steps, are of unequal
-    length and a little unsteady; the mode does without all that.
+    The hand hovers over the next onion along the belt, comes down on it, brings it before the eyes, and takes
+    it to its destination. Drawn actions wobble before the eyes for about ten steps, vary in length and are a
+    little unsteady; the mode has none of this noise.
 
     Fields
     ------
@@ -295,7 +295,7 @@ def _way(observations: Float[Array, "... 29"]) -> tuple[Float[Array, "... 3"], B
         carrying & ~over_belt & (jnp.abs(wrist[..., 1] - look[1]) < 0.05) & (wrist[..., 2] > look[2] - 0.1)
     )
     target = which(carrying, carried, to_onion)
-    # With nothing left to do the hand stays.
+    # The hand stays once all onions are sorted.
     return which(waiting.any(-1), target - wrist, jnp.zeros_like(wrist)), looking
 
 

@@ -24,7 +24,7 @@ LEVELS = (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 
 
 class Behaviour(Protocol):
-    """What acts: a policy network, or any JAX pytree with its two functions."""
+    """Policy that acts: a policy network, or any JAX pytree with its two functions."""
 
     def mode(self, observations: Array) -> Array:
         """Deterministic actions of observations ``[..., d]``."""
@@ -42,16 +42,15 @@ class _PerturbedFields(NamedTuple):
 
 @shown_briefly
 class Perturbed(_PerturbedFields):
-    """A policy that now and then, with probability ``share``, does anything within the bounds instead.
+    """Mixture of a policy and, with probability ``share``, the uniform policy within the bounds.
 
-    The mode is the policy's own. At 1 it is the uniform policy. Of actions without bounds there is no
-    uniform draw; ``policy.actions`` must have them.
+    The mode is the policy's own. At 1 it is the uniform policy. ``policy.actions`` must have bounds.
     """
 
     __slots__ = ()
 
     def mode(self, observations: Array) -> Array:
-        """What the policy itself would do."""
+        """Return the policy's own action."""
         return self.policy.mode(observations)
 
     def sample(self, key: Array, observations: Array) -> Array:
@@ -69,13 +68,13 @@ class Perturbed(_PerturbedFields):
 
 @shown_briefly
 class Trajectories(NamedTuple):
-    """Trajectories of at most ``T`` steps, from first states drawn; after termination nothing is live.
+    """Trajectories of at most ``T`` steps, from first states drawn; steps after termination are not live.
 
     Fields
     ------
     observations, next_observations : float ``[n, T, d]``
     actions : int ``[n, T]`` or float ``[n, T, k]``, as carried out (cut to the bounds)
-    rewards : float ``[n, T]``, the environment's own; zero where nothing is live
+    rewards : float ``[n, T]``, the environment's own; zero at steps that are not live
     live : bool ``[n, T]``
     terminated : bool ``[n]``
     """
@@ -94,7 +93,7 @@ class Trajectories(NamedTuple):
 
     @property
     def visited(self) -> Float[np.ndarray, "N d"]:
-        """All observations in which something was done."""
+        """Observations in which the policy acted."""
         return self.observations[self.live]
 
     @property
@@ -112,10 +111,10 @@ def simulate(
     *,
     deterministic: bool = False,
 ) -> Trajectories:
-    """Trajectories of ``length`` steps (the environment's horizon by default), or until they terminate.
+    """Simulate trajectories of ``length`` steps (the environment's horizon by default), or until they
+    terminate.
 
-    The horizon ends nothing else. ``deterministic`` takes the policy's mode. Raises ``ValueError`` for
-    fewer than one episode or step.
+    ``deterministic`` takes the policy's mode. Raises ``ValueError`` for fewer than one episode or step.
     """
     length = environment.horizon if length is None else length
     if episodes < 1 or length < 1:
@@ -149,7 +148,7 @@ def graded_mix(
 
 @partial(jax.jit, static_argnums=3)
 def acted(policy: Behaviour, key: Array, observations: Array, deterministic: bool) -> Array:
-    """What a policy does: its mode, or a draw. Compiled once for each kind of policy and batch."""
+    """Choose a policy's actions: its mode, or a draw. Compiled once for each kind of policy and batch."""
     return policy.mode(observations) if deterministic else policy.sample(key, observations)
 
 

@@ -42,7 +42,7 @@ LARGEST = 1e6  # MuJoCo takes larger numbers for an explosion, and starts the ro
 
 
 class _Task(NamedTuple):
-    """What Gymnasium sets for one robot; ``None`` where it has no such rule."""
+    """Gymnasium's rules for one robot; ``None`` for a rule that it does not have."""
 
     model: str
     frame_skip: int
@@ -98,7 +98,7 @@ class Locomotion(NamedTuple):
 
     @property
     def settings(self) -> tuple[tuple[str, Any], ...]:
-        """What tells it from others of its name."""
+        """Settings in which the task differs from others of its name."""
         return (("terminate_when_unhealthy", self.terminate_when_unhealthy),)
 
     @property
@@ -145,7 +145,9 @@ class Locomotion(NamedTuple):
         return following, rewards, terminated
 
     def observe(self, states: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "n d"]:
-        """What Gymnasium shows: positions but ``x``, and velocities (Hopper's and Walker2d's cut at ±10)."""
+        """Compute Gymnasium's observation: positions but ``x``, and velocities (Hopper's and Walker2d's cut
+        at ±10).
+        """
         task, nq = _TASKS[self.name], (self.observation_size + 1) // 2
         observations = np.array(states[..., 2:])
         if np.isfinite(task.velocity_limit):
@@ -154,7 +156,7 @@ class Locomotion(NamedTuple):
         return observations
 
     def healthy(self, states: Float[np.ndarray, "n D"]) -> Bool[np.ndarray, " n"]:
-        """Whether the robot is up: Gymnasium's bounds of height and pitch. HalfCheetah always is."""
+        """Test whether the robot is up: Gymnasium's bounds of height and pitch. HalfCheetah always is."""
         task = _TASKS[self.name]
         height, angle = states[:, 2], states[:, 3]
         return (
@@ -168,7 +170,7 @@ class Locomotion(NamedTuple):
     def next_state(
         self, observations: Float[np.ndarray, "n d"], actions: Float[np.ndarray, "n k"]
     ) -> Float[np.ndarray, "n d"]:
-        """The next observation, were the observation the state; no noise.
+        """Predict the next observation, with the observation taken for the state; no noise.
 
         Exact but where a velocity of Hopper or Walker2d was cut at ±10, which is so in every twelfth step of
         the stored Hopper and in half of the stored Walker2d. The worst next velocity is then off by 0.06 and
@@ -179,13 +181,13 @@ class Locomotion(NamedTuple):
     def jacobians(
         self, observations: Float[np.ndarray, "n d"], actions: Float[np.ndarray, "n k"], width: float = 1e-7
     ) -> tuple[Float[np.ndarray, "n d d"], Float[np.ndarray, "n d k"]]:
-        """Derivatives of :meth:`next_state` by the observation (``A``) and the action (``B``).
+        """Differentiate :meth:`next_state` by the observation (``A``) and the action (``B``).
 
         Central differences of half-width ``width``, all in one rollout of ``2 (d + k)`` robots each. At a
         bound of the actions the difference is taken from inside, and beyond it ``B`` is zero, as the action
-        is cut off. Where a foot touches the ground, or a velocity is cut off, between the two ends of a
-        difference, there is no derivative, and what is returned is the slope between them.
-        Raises as :meth:`step` does.
+        is cut off. If a foot touches the ground, or a velocity is cut off, between the two ends of a
+        difference, the derivative does not exist; the result is the slope between them. Raises as
+        :meth:`step` does.
         """
         states, cut = self._taken(observations, actions)
         n, d, k = len(states), self.observation_size, self.actions.size
@@ -209,7 +211,7 @@ class Locomotion(NamedTuple):
         return by_state.swapaxes(1, 2), by_action.swapaxes(1, 2)
 
     def silhouette(self, observation: Float[np.ndarray, " d"], x: float = 0.0) -> list[Capsule]:
-        """The robot seen from the side, its ``x`` given, in metres; the ground is at height zero."""
+        """Draw the robot from the side at a given ``x``, in metres; the ground is at height zero."""
         simulator = _simulator(self.name, self.threads)
         state = self._states(np.asarray(observation)[None])[0]
         state[1] = x
@@ -233,7 +235,8 @@ class Locomotion(NamedTuple):
 
 
 def locomotion(name: str, *, terminate_when_unhealthy: bool = True, threads: int | None = None) -> Locomotion:
-    """The task of ``"hopper"``, ``"walker2d"`` or ``"half-cheetah"``, with Gymnasium's default parameters.
+    """Make the task of ``"hopper"``, ``"walker2d"`` or ``"half-cheetah"``, with Gymnasium's default
+    parameters.
 
     ``threads`` is by default the number of processor cores allowed to this process. Raises ``ValueError``
     for another name, and ``ModuleNotFoundError`` that says what to install where MuJoCo is missing.
@@ -274,7 +277,7 @@ class _Simulator:
     def advance(
         self, states: Float[np.ndarray, "n D"], actions: Float[np.ndarray, "n k"]
     ) -> Float[np.ndarray, "n D"]:
-        """The states one step later."""
+        """Compute the states one step later."""
         n, m = len(states), self.frame_skip
         if n == 0:
             return states.copy()
@@ -295,7 +298,7 @@ class _Simulator:
         return path[:, -1].copy()
 
     def capsules(self, state: Float[np.ndarray, " D"]) -> list[Capsule]:
-        """Every limb as it lies in the plane of motion."""
+        """Place every limb in the plane of motion."""
         model = self.model
         with self._lock:
             scratch = self._scratch[0]
@@ -331,7 +334,7 @@ def _data_of(key: Array) -> Array:
 
 
 def _checked(given: Float[np.ndarray, "n m"], size: int, what: str) -> Float[np.ndarray, "n m"]:
-    """As 64-bit floats, or an error that names the first row that can not be."""
+    """Validate states or actions as 64-bit floats; an error names the first bad row."""
     rows = np.asarray(given, np.float64)
     if rows.ndim != 2 or rows.shape[1] != size:
         raise ValueError(f"{what} must be [robots, {size}], got the shape {list(rows.shape)}")

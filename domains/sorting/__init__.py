@@ -1,4 +1,4 @@
-"""Onion sorting on a conveyor, in several ways at once.
+"""Onion sorting on a conveyor, with several behaviours.
 
 Imports :mod:`i2rl.domains.gym`.
 """

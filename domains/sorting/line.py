@@ -1,29 +1,29 @@
-"""A line of onions whose quality is hidden: what a sorter's policy is worth in precision and recall.
+"""Belt of onions with hidden quality: precision and recall of a sorter's policy.
 
-The process of :mod:`i2rl.domains.sorting.process` knows no true quality, so a policy is carried out here on a
-belt of onions that have one (section 7.4.2: three sets of eight, four blemished, each gone after a fixed
-time). The policy sees the state of its process and nothing else; the world keeps which onion is where, what
-it is, and the time. Wherever the process tosses a coin that the world decides, the world decides:
+The process of :mod:`i2rl.domains.sorting.process` has no true quality, so a policy is executed here on a belt
+of onions that have one (section 7.4.2: three sets of eight, four blemished, each gone after a fixed time).
+The policy sees only the state of its process; the world holds the place and the quality of every onion, and
+the time. The world determines these random outcomes of the process:
 
-- what an inspection predicts: the onion's quality, right with probability :attr:`Line.inspection`;
-- what rolling lists: every onion on the table is judged by itself, right with probability
+- the prediction of an inspection: the onion's quality, right with probability :attr:`Line.inspection`;
+- the list that rolling makes: every onion on the table is judged by itself, right with probability
   :attr:`Line.rolling`, independently each time it is rolled;
-- when the list is empty: when the last onion listed is in the bin.
+- the end of the list: it is empty once the last onion listed is in the bin.
 
-The rest stays as the process has it. An onion is claimed at random, and putting one back claims another. A
-slip (5 %) changes nothing but costs the action's time. What the process leaves open is settled so:
+The process determines the rest. An onion is claimed at random, and putting one back claims another. A slip (5
+%) only costs the action's time. The world settles the details that the process leaves open:
 
 - an onion put back has been sorted: it is not claimed or rolled again, and counts as left on the table;
 - the claimed onion stays on the list until it is in the bin; a claim takes another onion if there is one;
 - a set comes in with an unknown onion claimed, no list made yet, and the hand where it was (first: at the
   conveyor);
 - an action not over when the set disappears has no effect, and an onion in the hand is not in the bin;
-- where no onion is left to sort, the sorter waits for the next set.
+- once no onion is left to sort, the sorter waits for the next set.
 
-The dissertation gives neither times nor accuracies. The defaults of :class:`Line` are set once. The
-accuracies are constants of earlier versions of the released code (0.95 for its detector, 0.7 for rolling).
-The times are plausible for a slow arm; those of a set, of rolling and of inspecting were picked from a grid
-of 36 so that the two *experts* come near their row of Table 7.2. Nothing is calibrated to a learner's row.
+The dissertation states no times and no accuracies. The defaults of :class:`Line` are set once. The accuracies
+are constants of earlier versions of the released code (0.95 for its detector, 0.7 for rolling). The times are
+plausible for a slow arm; those of a set, of rolling and of inspecting were picked from a grid of 36 so that
+the two *experts* come near their row of Table 7.2. No default is calibrated to a learner's row.
 """
 
 from __future__ import annotations
@@ -66,11 +66,11 @@ UNSORTED, IN_BIN, LEFT = range(3)
 
 
 class Line(NamedTuple):
-    """The belt, the sorter's perception and its speed; times in seconds. See the module for their origin.
+    """Belt, perception and speed of the sorter; times in seconds. The module states their origin.
 
     ``sets`` of ``onions`` each, ``blemished`` of them blemished, disappear one after the other, each after
     ``set_seconds``. ``inspection`` and ``rolling`` are the probabilities that an onion is judged rightly.
-    With probability ``slip`` an action does nothing. ``claim_seconds`` holds for both ways of claiming,
+    With probability ``slip`` an action has no effect. ``claim_seconds`` holds for both claiming actions,
     ``place_seconds`` for both places (the claim that goes with putting an onion back included),
     ``roll_seconds`` for rolling over the whole table once.
     """
@@ -92,15 +92,19 @@ class Line(NamedTuple):
     def seconds(self) -> tuple[float, ...]:
         """Duration of each action, in the order of ``ACTIONS``."""
         by_action = {
-            INSPECT: self.inspect_seconds, PLACE_ON_CONVEYOR: self.place_seconds,
-            PLACE_IN_BIN: self.place_seconds, PICK: self.pick_seconds, CLAIM_NEW: self.claim_seconds,
-            ROLL: self.roll_seconds, CLAIM_LISTED: self.claim_seconds,
-        }  # fmt: skip
+            INSPECT: self.inspect_seconds,
+            PLACE_ON_CONVEYOR: self.place_seconds,
+            PLACE_IN_BIN: self.place_seconds,
+            PICK: self.pick_seconds,
+            CLAIM_NEW: self.claim_seconds,
+            ROLL: self.roll_seconds,
+            CLAIM_LISTED: self.claim_seconds,
+        }
         return tuple(by_action[a] for a in range(len(ACTIONS)))
 
 
 class Share(NamedTuple):
-    """An estimated share with its confidence interval; all NaN where there was nothing to take a share of."""
+    """Estimated share with its confidence interval; all NaN without trials."""
 
     value: float
     low: float
@@ -109,7 +113,7 @@ class Share(NamedTuple):
 
 @shown_briefly
 class Tally(NamedTuple):
-    """How the onions of ``n`` belts ended.
+    """Outcomes of the onions of ``n`` belts.
 
     Fields
     ------
@@ -144,7 +148,7 @@ class Tally(NamedTuple):
 
 
 def wilson(successes: float, trials: float, level: float = 0.95) -> Share:
-    """A binomial share with Wilson's score interval; NaN without trials. Counts need not be whole."""
+    """Compute a binomial share with Wilson's score interval; NaN without trials. Counts may be fractional."""
     if not trials:
         return Share(math.nan, math.nan, math.nan)
     share, z = successes / trials, float(ndtri((1 + level) / 2))
@@ -157,9 +161,9 @@ def wilson(successes: float, trials: float, level: float = 0.95) -> Share:
 def _ratio(part: Int[np.ndarray, " n"], whole: Int[np.ndarray, " n"], level: float) -> Share:
     """Ratio of sums over belts, with Wilson's interval for the effective number of onions.
 
-    Onions of one belt are not independent. The delta method gives the variance of the ratio; the number of
-    independent onions of that variance is what Wilson's formula is given (Korn and Graubard 1998). Where no
-    belt strays from the ratio (every onion binned was blemished), onions count one by one.
+    Onions of one belt are not independent. The delta method gives the variance of the ratio; Wilson's formula
+    takes the number of independent onions of that variance (Korn and Graubard 1998). If no belt differs from
+    the ratio (every onion binned was blemished), onions count one by one.
     """
     total, n = int(whole.sum()), len(whole)
     if total == 0:
@@ -204,16 +208,22 @@ def sort_belts(
         raise ValueError(f"at least one belt is needed, got {belts}")
     with np.errstate(divide="ignore"):
         log_policy = jnp.asarray(np.log(policy))
-    # States, too, are padded with some that nothing leads to: all processes share that program.
+    # States, too, are padded with unreachable ones, so that all processes share that program.
     log_policy, process = jax.tree.map(_states_padded, (log_policy, _tables(sorting)))
     speeds = jnp.array(line.seconds), jnp.array(float(line.set_seconds))
     chances = jnp.array([line.inspection, line.rolling, line.slip], float)
     # Padded to a power of two, so that many numbers of belts share a compiled program.
     padded = 1 << max(8, (belts - 1).bit_length())
     counts = _sort_belts(
-        jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(padded)), log_policy, process, speeds, chances,
-        jnp.array(line.blemished), line.sets, line.onions,
-    )  # fmt: skip
+        jax.vmap(partial(jax.random.fold_in, key))(jnp.arange(padded)),
+        log_policy,
+        process,
+        speeds,
+        chances,
+        jnp.array(line.blemished),
+        line.sets,
+        line.onions,
+    )
     return Tally(*np.asarray(counts)[:belts].T)
 
 
@@ -291,7 +301,7 @@ def _tables(sorting: Sorting) -> _Tables:
 
 
 def _states_padded(table: Array) -> Array:
-    """A table ``[S, ...]`` with zeros up to the next multiple of 32 states."""
+    """Pad a table ``[S, ...]`` with zeros up to the next multiple of 32 states."""
     return jnp.pad(table, [(0, -len(table) % 32), *[(0, 0)] * (table.ndim - 1)])
 
 
@@ -351,9 +361,13 @@ def _sort_belts(
     def sort_set(hand: Int[Array, ""], key: Array) -> tuple:
         first, key = jax.random.split(key)
         begin = _World(
-            process.start[hand], jnp.zeros(()), jnp.zeros((), int), jax.random.randint(first, (), 0, onions),
-            jnp.full(onions, UNSORTED), jnp.zeros(onions, bool),
-        )  # fmt: skip
+            process.start[hand],
+            jnp.zeros(()),
+            jnp.zeros((), int),
+            jax.random.randint(first, (), 0, onions),
+            jnp.full(onions, UNSORTED),
+            jnp.zeros(onions, bool),
+        )
         end = lax.while_loop(
             lambda world: (world.clock < allowed) & jnp.any(world.where == UNSORTED), partial(act, key), begin
         )

@@ -46,7 +46,7 @@ _LIST = {
 
 
 def sorting_scene(sorting: Sorting) -> Scene:
-    """The conveyor, the eyes, the bin, the claimed onion coloured by what is thought of it, and the hand."""
+    """Draw the conveyor, eyes, bin, hand, and the claimed onion in the colour of its prediction."""
     axes = new_canvas(0, 11.6, 0, 7.2, 46, caption=1.1)
     _draw_table(axes)
     onion = Ellipse((0, 0), 0.92, 0.84, edgecolor=INK, linewidth=1.4, zorder=6)
@@ -100,7 +100,7 @@ def sorting_scene(sorting: Sorting) -> Scene:
 
 
 def _draw_table(axes: Axes) -> None:
-    # The belt and the onions nobody has claimed.
+    # The belt and the unclaimed onions.
     axes.add_patch(Rectangle((0.2, 0.75), 6.4, 0.45, facecolor=WALL, edgecolor=INK, linewidth=1.0))
     for x in np.arange(0.6, 6.6, 0.8):
         axes.add_patch(Circle((x, 0.97), 0.15, facecolor=FLOOR, edgecolor=INK, linewidth=0.8))

@@ -2,14 +2,13 @@
 
 A sorter claims an onion, picks it, inspects it and puts it where it belongs; or rolls its hand over all
 onions, which lists the blemished ones at once, and picks those. A state is ``(onion, prediction, hand,
-list)``. Three processes share one transition function and differ in their states and in what may be done
-where:
+list)``. Three processes share one transition function and differ in their states and available actions:
 
 - :func:`sorting_with_claiming`, 26 states: a new onion may be claimed while one is claimed. The default:
   on it the dissertation's three behaviours are three.
-- :func:`sorting_without_claiming`, the 23 states and the features of the released code. There "keep
-  claiming" cannot be expressed: its optimal policy is that of picking (the code's value iteration stopped
-  after one sweep, which hid it).
+- :func:`sorting_without_claiming`, the 23 states and the features of the released code. Its features cannot
+  express "keep claiming": its optimal policy is that of picking (the code's value iteration stopped after one
+  iteration, which hid it).
 - :func:`pick_inspect_place`, the 22 states that section 7.1.2 speaks of, without the list.
 
 A feature is an expectation over an action's intended outcomes; a slip (5 %) changes nothing in the state and
@@ -48,10 +47,18 @@ ACTIONS = ("inspect", "place on conveyor", "place in bin", "pick", "claim new", 
 INSPECT, PLACE_ON_CONVEYOR, PLACE_IN_BIN, PICK, CLAIM_NEW, ROLL, CLAIM_LISTED = range(7)
 
 FEATURES = (
-    "good on table", "blemished not on table", "good not in bin", "blemished in bin", "not idle",
-    "claims a new onion", "makes a list", "picks unknown", "picks blemished", "empties the list",
+    "good on table",
+    "blemished not on table",
+    "good not in bin",
+    "blemished in bin",
+    "not idle",
+    "claims a new onion",
+    "makes a list",
+    "picks unknown",
+    "picks blemished",
+    "empties the list",
     "inspects a held onion",
-)  # fmt: skip
+)
 
 BEHAVIOURS = ("pick-inspect-place", "roll-pick-place", "keep claiming")
 _RAW_WEIGHTS = np.array([
@@ -76,7 +83,7 @@ _STATES_WITH_CLAIMING = _STATES_WITHOUT_CLAIMING + " 4202 0212 0232"
 
 
 class State(NamedTuple):
-    """Where the claimed onion is, what is thought of it, where the hand is, and whether there is a list."""
+    """State of a sorter: the claimed onion's place and prediction, the hand's place, and the list."""
 
     onion: int
     prediction: int
@@ -103,7 +110,7 @@ class Sorting(NamedTuple):
     transition_features : float ``[S, A, K]``
         Expected features of what really happens, slips included.
     behaviours : tuple of str ``[B]``
-        Ways of sorting.
+        Behaviours of sorters.
     weights : float ``[B, K]``
         Their true weights, of L1 norm one.
     """
@@ -121,13 +128,13 @@ class Sorting(NamedTuple):
         return tuple(State(*map(int, row)) for row in self.factors)
 
     def expert_policy(self, behaviour: int) -> Float[np.ndarray, "S A"]:
-        """The optimal policy of a behaviour; where actions tie (none of ours do) the first is taken."""
+        """Compute the optimal policy of a behaviour; ties (none in ours) go to the first action."""
         return np.asarray(_greedy(self.mdp, jnp.asarray(self.weights[behaviour])))
 
 
 @shown_briefly
 class MixedDemonstration(NamedTuple):
-    """Trajectories done in several ways, and which way each was done (``[n]``, for judging only)."""
+    """Trajectories of several behaviours, and the behaviour of each (``[n]``, for judging only)."""
 
     demonstration: Demonstration
     labels: Int[np.ndarray, " n"]
@@ -145,10 +152,10 @@ def sorting_with_claiming() -> Sorting:
 
 @cache
 def sorting_without_claiming() -> Sorting:
-    """23 states, 31 pairs and the features of the released code, which look at outcomes alone.
+    """Build the 23 states, 31 pairs and features of the released code, which depend on outcomes alone.
 
-    Some of those features also fire where nobody meant them ("claims a new onion" when one is put back). A
-    real choice exists in 8 states only.
+    Some of those features also fire by accident ("claims a new onion" when one is put back). Only 8 states
+    have a real choice.
     """
     states = _parsed(_STATES_WITHOUT_CLAIMING)
     return _sorting(
@@ -170,9 +177,13 @@ def pick_inspect_place() -> Sorting:
     binned = [State(BIN, UNKNOWN, h, NO_LIST) for h in range(4)]
     weights = _RAW_PICK_INSPECT_PLACE / _RAW_PICK_INSPECT_PLACE.sum()
     return _sorting(
-        "pick-inspect-place", (*table, *held, *inspected, *binned), _without_list, _deeds, BEHAVIOURS[:1],
+        "pick-inspect-place",
+        (*table, *held, *inspected, *binned),
+        _without_list,
+        _deeds,
+        BEHAVIOURS[:1],
         weights[None],
-    )  # fmt: skip
+    )
 
 
 def demonstrate_sorting(
@@ -210,7 +221,7 @@ def _greedy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]
 
 
 def intended_outcomes(state: State, action: int) -> tuple[tuple[State, float], ...]:
-    """What an action is meant to lead to, with probabilities, before slips (the final action versions)."""
+    """Return an action's intended outcomes with probabilities, before slips (the final action versions)."""
     _, prediction, hand, listed = state
     if action == INSPECT:
         if prediction != UNKNOWN:
@@ -243,7 +254,7 @@ def intended_outcomes(state: State, action: int) -> tuple[tuple[State, float], .
 
 
 def _places(state: State) -> tuple[int, ...] | None:
-    """What every sorter does with an onion in hand; None where the processes differ."""
+    """Return the actions of every sorter on an onion in hand; None where the processes differ."""
     by_prediction = {UNKNOWN: INSPECT, BLEMISHED: PLACE_IN_BIN, GOOD: PLACE_ON_CONVEYOR}
     if state.onion in (INSPECTED, HELD):
         return (by_prediction[state.prediction],)
@@ -284,7 +295,7 @@ def _without_list(state: State) -> tuple[int, ...]:
 
 
 def _outcomes(state: State, action: int, following: State) -> tuple[bool, ...]:
-    """The released code's predicates on a state and what follows it."""
+    """Evaluate the released code's predicates on a state and its successor."""
     del action
     (onion, prediction, _, listed), (to, becomes, hand, relisted) = state, following
     return (
@@ -303,7 +314,7 @@ def _outcomes(state: State, action: int, following: State) -> tuple[bool, ...]:
 
 
 def _deeds(state: State, action: int, following: State) -> tuple[bool, ...]:
-    """The same, but what is named after an action asks for that action."""
+    """Evaluate the same predicates; those named after an action require that action."""
     fired = list(_outcomes(state, action, following))
     fired[0] = fired[0] and action == PLACE_ON_CONVEYOR
     fired[5] = action == CLAIM_NEW
@@ -350,9 +361,15 @@ def _sorting(
                 transition_features[i, action] += probability * ((1 - SLIP) * fired + SLIP * stays)
     initial = np.array([_may_start(state, states) for state in states], float)
     mdp = TabularMDP.from_dense(
-        transitions, features, initial=initial / initial.sum(), discount=DISCOUNT, available=available,
-        states=[state.name for state in states], actions=ACTIONS, feature_names=FEATURES,
-    )  # fmt: skip
+        transitions,
+        features,
+        initial=initial / initial.sum(),
+        discount=DISCOUNT,
+        available=available,
+        states=[state.name for state in states],
+        actions=ACTIONS,
+        feature_names=FEATURES,
+    )
     return Sorting(name, mdp, np.array(states), transition_features, behaviours, weights)
 
 

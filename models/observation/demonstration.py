@@ -112,7 +112,7 @@ class Demonstration:
         return brief_table(type(self).__name__, fields_of(self) if rows is None else rows)
 
     def _told(self) -> list[tuple[str, str]] | None:
-        """What it holds, in words; None where JAX put something else into the fields."""
+        """Describe the contents in words; None if JAX put something else into the fields."""
         if not readable(self.kind) or np.ndim(self.kind) != 2:
             return None
         kind = np.asarray(self.kind)
@@ -284,7 +284,7 @@ def concatenate(demonstrations: Sequence[Demonstration]) -> Demonstration:
 
 
 def _rows(given: Any, n: int) -> Any:
-    """What selects trajectories, as an index that keeps their axis."""
+    """Convert a selection of trajectories to an index that keeps their axis."""
     if isinstance(given, slice):
         return given
     try:

@@ -64,7 +64,7 @@ class Recording(NamedTuple):
         return brief_table(type(self).__name__, fields_of(self) if rows is None else rows)
 
     def _rows(self) -> list[tuple[str, str]] | None:
-        """What it holds, in words; None where JAX put something else into the fields."""
+        """Describe the contents in words; None if JAX put something else into the fields."""
         if not (readable(self.live) and readable(self.terminated)) or np.ndim(self.live) != 2:
             return None
         parts = [

@@ -4,9 +4,9 @@
 ``build/bench/adversarial_cost.json``. For comparison, the logs released with the dissertation put one such
 update (continuous onions) at a median of 0.86, 1.6 and 4.8 minutes on three machines.
 
-Parts, each compiled before it is timed: smoothing and drawing the truth behind a window of 32 reported pairs
+Parts, each compiled before it is timed: smoothing and drawing the truth behind a window of 32 observed pairs
 under the current policy with the dynamics as last linearised (*draw*), the same after linearising anew
-(*look*, which simulates), and the update of the discriminator on the draws (*update*).
+(*refresh*, which simulates), and the update of the discriminator on the draws (*update*).
 """
 
 from __future__ import annotations
@@ -56,14 +56,14 @@ def measured(name: str) -> dict[str, float]:
         found = trained(network, memory, policy, as_expert(drawn), replay, 1, jax.random.key(3))
         jax.block_until_ready(found)
 
-    def look() -> None:
+    def refresh() -> None:
         jax.block_until_ready(truth.refresh(chain, policy, jax.random.key(4), of.sensor))
 
-    parts = {"look": look, "update": update}
+    parts = {"refresh": refresh, "update": update}
     if hasattr(truth, "resample"):
         parts["draw"] = partial(_drawn, truth, chain, policy, of.sensor)
     times = {part: 1e3 * median_seconds(action, RUNS) for part, action in parts.items()}
-    return {"draw": times["look"], **times}
+    return {"draw": times["refresh"], **times}
 
 
 def _drawn(truth: object, chain: object, policy: object, sensor: object) -> None:
@@ -82,12 +82,12 @@ def main() -> None:
     names = ("mountain-car", "onion", "hopper", "walker2d", "half-cheetah")
     results = {name: measured(name) for name in names}
     rows = [
-        (name, t["draw"], t["update"], t["draw"] + t["update"], t["look"], t["look"] + t["update"])
+        (name, t["draw"], t["update"], t["draw"] + t["update"], t["refresh"], t["refresh"] + t["update"])
         for name, t in results.items()
     ]
     print_table(
         f"One robust discriminator update of {PAIRS} pairs, ms (median of {RUNS})",
-        ["task", "draw", "update", "draw + update", "look", "look + update"],
+        ["task", "draw", "update", "draw + update", "refresh", "refresh + update"],
         rows,
     )
     publish("adversarial_cost", results)

@@ -9,13 +9,13 @@
 - seconds of a session against the number of predicates, of states, and of pairs in a session, with the
   exponent of a power of that number fitted to the medians.
 
-Section 6.1.4 has it that "the complexity of each iteration of each session is
-``O(m |Xi_d| L N_sa + L K + m^2 n_bfgs + eta)``, where ``eta = n_RL + n_desc``": ``m`` predicates, ``|Xi_d|``
-trajectories of ``L`` steps, ``N_sa`` pairs, ``K`` features, and three numbers of iterations taken for
-constants. It is linear in pairs ``N_sa``, linear in the steps of a session, and of degree two in ``m``. Two
-costs are not in it: planning and smoothing, and normalising Eq. 6.5, which is a sum over reports for every
-class of truths. Here that is ``O(C E (m + 1) + E m^2)`` a Newton step for ``C`` classes and ``E`` patterns of
-agreement, with ``E <= min(2^m, C^2)``: no polynomial in ``m`` until all pairs differ.
+Section 6.1.4 states that "the complexity of each iteration of each session is ``O(m |Xi_d| L N_sa + L K + m^2
+n_bfgs + eta)``, where ``eta = n_RL + n_desc``": ``m`` predicates, ``|Xi_d|`` trajectories of ``L`` steps,
+``N_sa`` pairs, ``K`` features, and three numbers of iterations taken for constants. It is linear in pairs
+``N_sa``, linear in the steps of a session, and of degree two in ``m``. Two costs are not in it: planning and
+smoothing, and normalising Eq. 6.5, which is a sum over observations for every class of truths. Here that is
+``O(C E (m + 1) + E m^2)`` a Newton step for ``C`` classes and ``E`` patterns of agreement, with ``E <=
+min(2^m, C^2)``: no polynomial in ``m`` until all pairs differ.
 """
 
 from __future__ import annotations
@@ -56,13 +56,13 @@ from ..harness import median_seconds, print_table, publish, seconds
 
 REPORTED = "RIMEO, stepwise"
 COUNTED = "RIFOM"
-# Of a report, that it is of any pair whatever.
+# Probability that an observation is any pair.
 ASTRAY = 0.1
 WARM = 3
 
 
 class Stream(NamedTuple):
-    """What a learner is timed on: a process, predicates ``[J, S, A]``, and sessions of ``trajectories``."""
+    """Task of a timed learner: a process, predicates ``[J, S, A]``, and sessions of ``trajectories``."""
 
     mdp: TabularMDP
     predicates: Int[np.ndarray, "J S A"]
@@ -81,19 +81,24 @@ class Growth(NamedTuple):
 
 
 def stream_of(task: NoisyTask, sessions: int, trajectories: int = 2, steps: int = 3, seed: int = 0) -> Stream:
-    """Scored reports of a noisy task."""
+    """Scored observations of a noisy task."""
     drawn = demonstrate_noisy(
-        jax.random.key(seed), task, sessions=sessions, trajectories=trajectories, steps=steps,
+        jax.random.key(seed),
+        task,
+        sessions=sessions,
+        trajectories=trajectories,
+        steps=steps,
         scores="calibrated",
-    )  # fmt: skip
+    )
     return Stream(drawn.mdp, task.features, drawn.seen, trajectories)
 
 
 def random_stream(size: int, predicates: int, sessions: int, *, named: bool = False, seed: int = 0) -> Stream:
-    """A grid of ``size x size`` cells, predicates of its pairs drawn by coin, and reports with scores.
+    """Simulate a grid of ``size x size`` cells, predicates of its pairs drawn by coin, observations with
+    scores.
 
-    With ``named``, state and action are known by two labels besides, so that no two pairs are one class. A
-    tenth of the reports are of any pair; the expert is soft.
+    With ``named``, state and action have two further labels, so that every pair is a class of its own. A
+    tenth of the observations are of any pair; the expert is soft.
     """
     rng = np.random.default_rng(seed)
     world = random_object_world(jax.random.key(seed), size, 0, slip=0.1, discount=0.95)
@@ -185,13 +190,16 @@ def session_seconds(task: NoisyTask, sessions: int) -> dict[str, dict[str, float
     for name, x in spent.items():
         ratio, low, high = ratio_of_medians(x, spent[COUNTED])
         found[name] = {
-            "median": float(np.median(x)), "nine in ten below": float(np.quantile(x, 0.9)),
-            "times RIFOM": ratio, "from": low, "to": high,
-        }  # fmt: skip
+            "median": float(np.median(x)),
+            "nine in ten below": float(np.quantile(x, 0.9)),
+            "times RIFOM": ratio,
+            "from": low,
+            "to": high,
+        }
     return found
 
 
-def part_seconds(task: NoisyTask, sessions: int = 20, runs: int = 200) -> dict[str, float]:
+def part_seconds(task: NoisyTask, sessions: int = 20, replications: int = 200) -> dict[str, float]:
     """Seconds of each part of RIMEO's session, with scores step by step, compiled alone.
 
     At the state that a learner is in after ``sessions``. Reports are prepared once, the two fits occur
@@ -241,7 +249,7 @@ def part_seconds(task: NoisyTask, sessions: int = 20, runs: int = 200) -> dict[s
     found = {}
     for name, (part, arguments) in parts.items():
         compiled = jax.jit(part)
-        found[name] = median_seconds(lambda: jax.block_until_ready(compiled(*arguments)), runs)  # noqa: B023
+        found[name] = median_seconds(lambda: jax.block_until_ready(compiled(*arguments)), replications)  # noqa: B023
     return found
 
 
@@ -259,9 +267,10 @@ def pattern_seconds(
         told = report_statistic(classes, logits, reports, confidence, pairs)
         fit = jax.jit(lambda x, logits: fit_sensor(classes, x, 0.05, logits))  # noqa: B023
         found[str(number)] = {
-            "classes": len(classes.reportable), "patterns": len(classes.patterns),
+            "classes": len(classes.reportable),
+            "patterns": len(classes.patterns),
             "seconds of a fit": median_seconds(lambda: jax.block_until_ready(fit(told, logits)), 20),  # noqa: B023
-        }  # fmt: skip
+        }
     return found
 
 
@@ -303,7 +312,7 @@ def main() -> None:
         "pairs in a session (noisy patrol)": lambda: measured_growth(
             tuple(lengths), lambda pairs: stream_of(patrol, count, *lengths[pairs])
         ),
-    }  # fmt: skip
+    }
     results["growth"] = {}
     for title, study in studies.items():
         found = study()

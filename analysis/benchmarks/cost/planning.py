@@ -1,4 +1,4 @@
-"""How long planning takes, and how much memory, as the number of states grows.
+"""Time and memory of planning as the number of states grows.
 
 ``python -m i2rl.analysis.benchmarks.cost.planning`` prints one JSON object a line for every pair of a size
 and a discount, each measured in a process of its own, so that peak memory is that measurement's alone;
@@ -29,7 +29,7 @@ REACH = 3
 
 
 def local_moves(n_states: int, discount: float, seed: int = 0) -> TabularMDP:
-    """A ring on which each of 4 actions leads to 3 random states at most ``REACH`` steps away.
+    """Build a ring on which each of 4 actions leads to 3 random states at most ``REACH`` steps away.
 
     Local moves are the slow case for sweeping: news crosses the ring a few states at a time. The two
     features are uniform random numbers.

@@ -3,7 +3,7 @@
 ``python -m i2rl.analysis.benchmarks.cost.sessions`` measures, on patrol instance 2 at 30 % observability:
 
 - IPOPT iterations of a session's programs (warm-started within the session and from the one before), and of
-  its last program from nothing;
+  its last program from a cold start;
 - the time of a session after 10 and after 1000 sessions, and the growth of memory in between;
 - the cumulative time of 239 online sessions against one batch run over all of them, and against batch
   re-run after every session;
@@ -35,7 +35,9 @@ from ..harness import print_table, publish, seconds
 
 
 def ipopt_iterations(sessions: int, seed: int = 0) -> dict[str, Any]:
-    """IPOPT iterations per program: as the learner solves it, and the session's last program from nothing."""
+    """Count IPOPT iterations per program: as the learner solves it, and the session's last program from a
+    cold start.
+    """
     patrol = instance(2)
     demonstration = demonstrate(jax.random.key(seed), patrol, 30, sessions)[0]
     result = {}
@@ -48,7 +50,7 @@ def ipopt_iterations(sessions: int, seed: int = 0) -> dict[str, Any]:
         for one in demonstration.sessions():
             state, report = learner.update(state, one)
             kept = state.statistic
-            # With these two statistics what is kept is what the last program was about.
+            # With these two statistics the state is the last program's data.
             if statistic == "features":
                 target = FeatureTarget(np.asarray(kept.features), np.asarray(kept.start))
                 solved = features.solve(target, slack / (1 - float(patrol.mdp.discount)))
@@ -88,7 +90,7 @@ def steady_cost(sessions: int = 1000, window: int = 50) -> dict[str, float]:
     }
 
 
-def online_against_batch(sessions: int, runs: int, rerun_points: int = 12) -> dict[str, float]:
+def online_against_batch(sessions: int, replications: int, rerun_points: int = 12) -> dict[str, float]:
     """Cumulative seconds of online sessions, of one batch run, and of batch re-run after every session.
 
     Re-running is measured at ``rerun_points`` evenly spread sessions (shapes compiled first) and summed by
@@ -98,7 +100,7 @@ def online_against_batch(sessions: int, runs: int, rerun_points: int = 12) -> di
     learner = lme_i2rl(patrol.mdp, patrol.visibility(30))
     batch = batch_lme(patrol.mdp, patrol.visibility(30))
     online, once, rerun = [], [], []
-    for seed in range(runs + 1):
+    for seed in range(replications + 1):
         demonstration = demonstrate(jax.random.key(seed), patrol, 30, sessions)[seed % 2]
         key = jax.random.key(seed)
         # A first pass over the same shapes compiles; it is not timed.
@@ -127,7 +129,7 @@ def online_against_batch(sessions: int, runs: int, rerun_points: int = 12) -> di
 
 
 def ring(n_states: int, n_actions: int = 4, n_features: int = 6, seed: int = 0) -> TabularMDP:
-    """A random MDP of local moves on a ring, three successors a pair, binary features."""
+    """Build a random MDP of local moves on a ring, three successors a pair, binary features."""
     rng = np.random.default_rng(seed)
     offsets = np.stack([np.full((n_states, n_actions), d) for d in (-1, 0, 1)], -1)
     successors = (np.arange(n_states)[:, None, None] + offsets) % n_states
@@ -146,9 +148,11 @@ def session_cost(mdp: TabularMDP, length: int, trajectories: int, sessions: int 
     full = Demonstration.from_pairs(np.asarray(states), np.asarray(actions))
     inside = np.asarray(view.in_view)[full.state] > 0
     hidden = Demonstration(
-        np.where(inside, full.kind, HIDDEN).astype(np.int8), np.where(inside, full.state, UNKNOWN),
-        np.where(inside, full.action, UNKNOWN), full.score,
-    )  # fmt: skip
+        np.where(inside, full.kind, HIDDEN).astype(np.int8),
+        np.where(inside, full.state, UNKNOWN),
+        np.where(inside, full.action, UNKNOWN),
+        full.score,
+    )
     run = run_sessions(lme_i2rl(mdp, view), hidden.sessions(trajectories), key=jax.random.key(0))
     return float(np.median([r.seconds / r.iterations for r in run.infos[2:]]))
 
@@ -157,12 +161,12 @@ def main() -> None:
     """Run and publish."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0] if __doc__ else None)
     parser.add_argument("--sessions", type=int, default=239)
-    parser.add_argument("--runs", type=int, default=5)
+    parser.add_argument("--replications", type=int, default=5)
     options = parser.parse_args()
     studies: dict[str, Callable[[], dict[str, Any]]] = {
         "ipopt iterations": lambda: ipopt_iterations(60),
         "session time": steady_cost,
-        "online against batch": lambda: online_against_batch(options.sessions, options.runs),
+        "online against batch": lambda: online_against_batch(options.sessions, options.replications),
         "seconds of a step against states": lambda: {
             str(n): session_cost(ring(n), 5, 1) for n in (32, 124, 496, 1024)
         },

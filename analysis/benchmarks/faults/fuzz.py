@@ -5,8 +5,8 @@ Run as ``python -m i2rl.analysis.benchmarks.faults.fuzz``.
 Lines: lines of both formats are composed, with values now and then that JSON allows and readers must not,
 mutated (characters replaced, inserted, deleted and repeated) and given to every reader of lines, and rows of
 recordings of onions to theirs. Each line has to be read, or to end in the reader's own error, which names
-file and line in at most a few hundred printable characters. What is read has to be writable and to read back
-the same.
+file and line in at most a few hundred printable characters. Content that is read must be writable and read
+back the same.
 
 Archives: valid archives of processes are mutated byte by byte, and others are crafted to overwhelm or mislead
 a reader (bombs, lies about sizes, encryption, other compressions, objects, absurd shapes and headers). Each
@@ -58,15 +58,15 @@ LIMIT = 2**22
 
 
 class Tally(NamedTuple):
-    """What became of inputs.
+    """Outcomes of inputs.
 
     Fields
     ------
     inputs : int
     read : int
-        Accepted; the rest was refused by the reader's own error.
+        Accepted inputs; the reader refused the rest by its own error.
     problems : tuple of str
-        Whatever else happened, at most a hundred.
+        All other outcomes, at most a hundred.
     seconds : float
     peak : int
         Largest memory allocated while reading one of them, in bytes; -1 if it was not measured.
@@ -85,18 +85,59 @@ class Tally(NamedTuple):
 def tiny_process() -> TabularMDP:
     """Three named states and two named actions."""
     return TabularMDP.from_successors(
-        np.zeros((3, 2, 1), int), np.ones((3, 2, 1)), np.zeros((3, 2, 1)),
-        states=("bin", "the table", "größe"), actions=("grasp", "place"),
-    )  # fmt: skip
+        np.zeros((3, 2, 1), int),
+        np.ones((3, 2, 1)),
+        np.zeros((3, 2, 1)),
+        states=("bin", "the table", "größe"),
+        actions=("grasp", "place"),
+    )
 
 
 _VALUES = (
-    "null", "true", "false", "0", "-0", "1", "-1", "3", "127", "128", "1.0", "0.5", "1.5", "1e999", "-1e999",
-    "NaN", "Infinity", "-Infinity", "99999999999999999999", "1" * 4301, "[]", "{}", "[[]]", '""', '"hidden"',
-    '"s"', '"\\ud800"', '"\\u0000"', '"\\u001b[31m"', "[" * 500, "[" * 2000, '{"s":' * 300,
+    "null",
+    "true",
+    "false",
+    "0",
+    "-0",
+    "1",
+    "-1",
+    "3",
+    "127",
+    "128",
+    "1.0",
+    "0.5",
+    "1.5",
+    "1e999",
+    "-1e999",
+    "NaN",
+    "Infinity",
+    "-Infinity",
+    "99999999999999999999",
+    "1" * 4301,
+    "[]",
+    "{}",
+    "[[]]",
+    '""',
+    '"hidden"',
+    '"s"',
+    '"\\ud800"',
+    '"\\u0000"',
+    '"\\u001b[31m"',
+    "[" * 500,
+    "[" * 2000,
+    '{"s":' * 300,
     '{"s": 1, "s": 2}',
-    '"' + "x" * 5000 + '"', "\ufeff", "\x00", "\x1b[2J", "\u2028", "\ud800", "'bin'", "// no", "1_000", "٣",
-)  # fmt: skip
+    '"' + "x" * 5000 + '"',
+    "\ufeff",
+    "\x00",
+    "\x1b[2J",
+    "\u2028",
+    "\ud800",
+    "'bin'",
+    "// no",
+    "1_000",
+    "٣",
+)
 _ALPHABET = '{}[]",:0123456789.eE+-satn \t\\/\x00\x7f\u00e9\u2028\U0001f400\ud800\ufeff'
 
 
@@ -108,7 +149,7 @@ _STEPS = {
 
 
 def composed_trajectory(draws: random.Random) -> str:
-    """A line of a trajectory, valid but for a value now and then."""
+    """Compose a line of a trajectory, valid but for a value now and then."""
     pick, chance = draws.choice, draws.random
 
     def value(valid: Sequence[str]) -> str:
@@ -128,7 +169,7 @@ def composed_trajectory(draws: random.Random) -> str:
 
 
 def composed_bout(draws: random.Random) -> str:
-    """A line of a walk in the labyrinth, valid but for a node or a frame now and then."""
+    """Compose a line of a walk in the labyrinth, valid but for a node or a frame now and then."""
     pick, chance = draws.choice, draws.random
     nodes = [0]
     for _ in range(1 + draws.randrange(8)):
@@ -143,7 +184,7 @@ def composed_bout(draws: random.Random) -> str:
 
 
 def composed_row(draws: random.Random) -> str:
-    """A row of a recording of onions, valid but for a cell now and then."""
+    """Compose a row of a recording of onions, valid but for a cell now and then."""
     cells = [draws.choice(("0.00", "0", "-0.0", "1e-3", " 0 ")) for _ in range(SIZE)]
     if draws.random() < 0.5:
         cells[draws.randrange(SIZE)] = draws.choice(_VALUES)
@@ -246,7 +287,7 @@ def _fuzzed(
 
 
 def largest_lines(limits: LineLimits = DEFAULT_LIMITS) -> dict[str, int]:
-    """Most memory allocated while reading lines of the size of the limit, in bytes, by what they hold."""
+    """Measure the most memory allocated while reading lines of the limit's size, in bytes, by content."""
     size, mdp = limits.size, tiny_process()
     lines = {
         "steps within the limit": json.dumps([{"s": "bin", "a": 1, "score": 0.5}] * limits.steps),
@@ -272,18 +313,22 @@ def largest_lines(limits: LineLimits = DEFAULT_LIMITS) -> dict[str, int]:
 
 
 def plain_archive(**options: Any) -> bytes:
-    """A valid archive of a small process with names and a view."""
+    """Make a valid archive of a small process with names and a view."""
     mdp = TabularMDP.from_successors(
-        np.array([[[0, 1], [1, 2]]] * 3), np.full((3, 2, 2), 0.5), np.arange(12.0).reshape(3, 2, 2),
-        states=("bin", "table", "größe"), actions=("grasp", "place"), **options,
-    )  # fmt: skip
+        np.array([[[0, 1], [1, 2]]] * 3),
+        np.full((3, 2, 2), 0.5),
+        np.arange(12.0).reshape(3, 2, 2),
+        states=("bin", "table", "größe"),
+        actions=("grasp", "place"),
+        **options,
+    )
     with tempfile.TemporaryDirectory() as folder:
         save_mdp(Path(folder) / "m.npz", mdp, np.array([1.0, 0.5, 0.0]))
         return (Path(folder) / "m.npz").read_bytes()
 
 
 def mutated_archives(seed: int, n: int) -> Iterator[bytes]:
-    """Valid archives with bytes flipped, deleted, repeated or cut off; some of them have right checksums."""
+    """Flip, delete, repeat or cut off bytes of valid archives; some of them have right checksums."""
     draws = random.Random(seed)
     base = plain_archive()
     arrays = _entries(base)
@@ -351,7 +396,7 @@ class _Raw(NamedTuple):
 
 
 def _raw_archive(entries: Sequence[_Raw], repeated: int = 1) -> bytes:
-    """An archive of entries as they are, its list ``repeated``."""
+    """Write an archive of entries as they are, its list ``repeated``."""
     body, listed = bytearray(), bytearray()
     for entry in entries:
         fields = (entry.method, 0, 0, entry.crc, len(entry.content), entry.size, len(entry.name), 0)
@@ -365,10 +410,10 @@ def _raw_archive(entries: Sequence[_Raw], repeated: int = 1) -> bytes:
 
 
 def _bomb(name: str, head: bytes, megabytes: int, others: dict[str, bytes], size: int | None = None) -> bytes:
-    """An archive with an array that inflates to so many zeros behind its head, and says to have ``size``."""
+    """Write an archive with an array that inflates to so many zeros behind its head, and claims ``size``."""
     squeeze = zlib.compressobj(9, zlib.DEFLATED, -15)
     first = squeeze.compress(head) + squeeze.flush(zlib.Z_FULL_FLUSH)
-    # After a full flush blocks depend on nothing before them, and can be repeated.
+    # After a full flush blocks are independent of earlier ones, and can be repeated.
     block = squeeze.compress(bytes(2**20)) + squeeze.flush(zlib.Z_FULL_FLUSH)
     content = first + block * megabytes + squeeze.flush()
     size = len(head) + (megabytes << 20) if size is None else size
@@ -397,32 +442,100 @@ def crafted_archives() -> dict[str, bytes]:
         {name: _npy(np.zeros(2**16)) for name in arrays}, zipfile.ZIP_DEFLATED
     )
     for shape in (
-        f"({2**70},)", f"({2**32}, {2**32})", f"(0, {2**62})", "(0,)", f"({2**63 - 1},)", "(-1,)",
-        "(3, 2, 3)", "(3, 2)", "(12,)", "()", "(3, 2, 2, 1, 1, 1, 1, 1)", "(" + "1, " * 40 + ")",
+        f"({2**70},)",
+        f"({2**32}, {2**32})",
+        f"(0, {2**62})",
+        "(0,)",
+        f"({2**63 - 1},)",
+        "(-1,)",
+        "(3, 2, 3)",
+        "(3, 2)",
+        "(12,)",
+        "()",
+        "(3, 2, 2, 1, 1, 1, 1, 1)",
+        "(" + "1, " * 40 + ")",
         "(" + "1, " * 900 + ")",
-        "(1e3,)", "(True,)", "((3, 2, 2),)", "[3, 2, 2]", "(3L, 2L, 2L)", "None", "(" + "9" * 3000 + ",)",
-    ):  # fmt: skip
+        "(1e3,)",
+        "(True,)",
+        "((3, 2, 2),)",
+        "[3, 2, 2]",
+        "(3L, 2L, 2L)",
+        "None",
+        "(" + "9" * 3000 + ",)",
+    ):
         features(f"shape {shape[:40]}", _described("'<f8'", shape, bytes(96)))
     # Types.
     for descr in (
-        "'|O'", "'<c16'", "'<c8'", "'|b1'", "'<U2'", "'|S8'", "'|V8'", "'<M8[s]'", "'<m8'", "'<f2'", "'<f4'",
-        "'>f8'", "'<f16'", "'<i8'", "'<u8'", "'|i1'", "'<f3'", "'<q9'", "'<U0'", "'|V0'", f"'<U{2**31}'",
-        "'<U999999999'", "'|S999999999'", "'f'", "'double'", "''", "'<'", "8", "None", "[('a', '<f8')]",
-        "[('a', '|O')]", "{'a': 1}", "'<f8' + '<f8'", "'<f8' '<f8'", "b'<f8'", "'\\x3cf8'", "('<f8', (2,))",
-    ):  # fmt: skip
+        "'|O'",
+        "'<c16'",
+        "'<c8'",
+        "'|b1'",
+        "'<U2'",
+        "'|S8'",
+        "'|V8'",
+        "'<M8[s]'",
+        "'<m8'",
+        "'<f2'",
+        "'<f4'",
+        "'>f8'",
+        "'<f16'",
+        "'<i8'",
+        "'<u8'",
+        "'|i1'",
+        "'<f3'",
+        "'<q9'",
+        "'<U0'",
+        "'|V0'",
+        f"'<U{2**31}'",
+        "'<U999999999'",
+        "'|S999999999'",
+        "'f'",
+        "'double'",
+        "''",
+        "'<'",
+        "8",
+        "None",
+        "[('a', '<f8')]",
+        "[('a', '|O')]",
+        "{'a': 1}",
+        "'<f8' + '<f8'",
+        "'<f8' '<f8'",
+        "b'<f8'",
+        "'\\x3cf8'",
+        "('<f8', (2,))",
+    ):
         features(f"type {descr}", _described(descr, "(3, 2, 2)", bytes(96)))
     for fortran in ("True", "1", "None", "'True'", "[]"):
         features(f"order {fortran}", _described("'<f8'", "(3, 2, 2)", bytes(96), fortran))
     # Headers.
     good = b"{'descr': '<f8', 'fortran_order': False, 'shape': (3, 2, 2), }"
     for header in (
-        b"", b"-" * 9000, b"-" * 4000, b"(" * 4000, b"[" * 60000, b"{" * 4096, b"\x00" * 100, b"\xff" * 100,
-        b"__import__('os')", b"{}", good * 2, good + b"#" * 100, good + b" " * 4000, good + b" " * 60000,
-        good.replace(b"'descr'", b"'Descr'"), good.replace(b"'shape'", b"'descr'"), good[:-1], b" " * 4000,
-        good.replace(b", }", b", 'x': 1}"), good.replace(b": (", b":  \t ("), good.replace(b"'", b'"'),
-        b"{'descr': '<f8'}", good.replace(b"False", b"F" * 4000), b"{" + b"'descr':'<f8'," * 250 + b"}",
+        b"",
+        b"-" * 9000,
+        b"-" * 4000,
+        b"(" * 4000,
+        b"[" * 60000,
+        b"{" * 4096,
+        b"\x00" * 100,
+        b"\xff" * 100,
+        b"__import__('os')",
+        b"{}",
+        good * 2,
+        good + b"#" * 100,
+        good + b" " * 4000,
+        good + b" " * 60000,
+        good.replace(b"'descr'", b"'Descr'"),
+        good.replace(b"'shape'", b"'descr'"),
+        good[:-1],
+        b" " * 4000,
+        good.replace(b", }", b", 'x': 1}"),
+        good.replace(b": (", b":  \t ("),
+        good.replace(b"'", b'"'),
+        b"{'descr': '<f8'}",
+        good.replace(b"False", b"F" * 4000),
+        b"{" + b"'descr':'<f8'," * 250 + b"}",
         good.replace(b"(3, 2, 2)", b"(" + b" " * 3900 + b"3,2,2)"),
-    ):  # fmt: skip
+    ):
         for version in (b"\x01\x00", b"\x02\x00", b"\x03\x00"):
             features(f"header {version!r} {header[:40]!r} {len(header)}", _headed(header, bytes(96), version))
     for magic in (b"", b"\x93", b"\x93NUMPY", b"\x93NUMPY\x04\x00", b"\x93NUMPX\x01\x00", b"PK\x03\x04"):
@@ -433,11 +546,17 @@ def crafted_archives() -> dict[str, bytes]:
     features("one byte more", arrays["features.npy"] + b"\0")
     # Contents.
     for name, array in {
-        "successors": np.full((3, 2, 2), 2**62), "probabilities": np.full((3, 2, 2), np.nan),
-        "features": np.full((3, 2, 2), np.inf), "initial": np.full(3, 1e308), "discount": np.array(np.nan),
-        "available": np.zeros((3, 2), bool), "in_view": np.array([2.0, 0, 0]), "states": np.array(["a"] * 3),
-        "actions": np.array(["grasp", "x" * 10**5]), "feature_names": np.array([["a", "b"]]),
-    }.items():  # fmt: skip
+        "successors": np.full((3, 2, 2), 2**62),
+        "probabilities": np.full((3, 2, 2), np.nan),
+        "features": np.full((3, 2, 2), np.inf),
+        "initial": np.full(3, 1e308),
+        "discount": np.array(np.nan),
+        "available": np.zeros((3, 2), bool),
+        "in_view": np.array([2.0, 0, 0]),
+        "states": np.array(["a"] * 3),
+        "actions": np.array(["grasp", "x" * 10**5]),
+        "feature_names": np.array([["a", "b"]]),
+    }.items():
         found[f"content of {name}"] = _archive({**arrays, f"{name}.npy": _npy(array)})
     found["objects"] = _archive({**arrays, "states.npy": _npy(np.array([{}, [], 1], object))})
     found["text beyond Unicode"] = _archive(
@@ -456,9 +575,17 @@ def crafted_archives() -> dict[str, bytes]:
         for value in values:
             found[f"{what} {value}"] = _patched(base, offset, value)
     for name in (
-        "reward.npy", "features", "features.NPY", "../features.npy", "/etc/passwd", "features.npy/",
-        "x" * 60000, "é.npy", "\x1b[31m.npy", "features.npy.npy",
-    ):  # fmt: skip
+        "reward.npy",
+        "features",
+        "features.NPY",
+        "../features.npy",
+        "/etc/passwd",
+        "features.npy/",
+        "x" * 60000,
+        "é.npy",
+        "\x1b[31m.npy",
+        "features.npy.npy",
+    ):
         found[f"name {name[:20]!r}"] = _archive({**arrays, name: b"\0" * 100})
     for name in arrays:
         found[f"without {name}"] = _archive({k: v for k, v in arrays.items() if k != name})
@@ -485,7 +612,7 @@ def crafted_archives() -> dict[str, bytes]:
 
 
 def _patched(content: bytes, offset: int, value: int) -> bytes:
-    """The 16-bit field at ``offset`` in every local header, and in every entry of the list, set."""
+    """Set the 16-bit field at ``offset`` in every local header, and in every entry of the list."""
     patched = bytearray(content)
     for signature, extra in ((b"PK\x03\x04", 0), (b"PK\x01\x02", 2)):
         at = content.find(signature)
@@ -498,7 +625,7 @@ def _patched(content: bytes, offset: int, value: int) -> bytes:
 def fuzz_archives(contents: Iterable[tuple[str, bytes]], limit: int = LIMIT) -> Tally:
     """Load each archive with a limit, beyond which reading must not allocate memory.
 
-    Memory is what Python and NumPy allocate while the file is read and the process is built.
+    Memory is the allocation of Python and NumPy while the file is read and the process is built.
     """
     began, count, accepted, peak, problems = time.perf_counter(), 0, 0, 0, list[str]()
     with tempfile.TemporaryDirectory() as folder:
@@ -545,18 +672,26 @@ def main() -> None:
     tallies["mutated archives"] = fuzz_archives(mutated)
     tallies["crafted archives"] = fuzz_archives(crafted_archives().items())
     rows = [
-        (name, t.inputs, t.read, len(t.problems), t.seconds, 1e6 * t.seconds / max(t.inputs, 1),
-         "" if t.peak < 0 else f"{t.peak / 2**20:.1f}")
+        (
+            name,
+            t.inputs,
+            t.read,
+            len(t.problems),
+            t.seconds,
+            1e6 * t.seconds / max(t.inputs, 1),
+            "" if t.peak < 0 else f"{t.peak / 2**20:.1f}",
+        )
         for name, t in tallies.items()
-    ]  # fmt: skip
+    ]
     print_table(
         "Hostile input", ("reader", "inputs", "read", "problems", "seconds", "µs each", "peak (MiB)"), rows
     )
     peaks = largest_lines()
     print_table(
-        f"Memory of reading one line (limit {DEFAULT_LIMITS.size} characters)", ("line", "peak (MiB)"),
+        f"Memory of reading one line (limit {DEFAULT_LIMITS.size} characters)",
+        ("line", "peak (MiB)"),
         [(name, peak / 2**20) for name, peak in peaks.items()],
-    )  # fmt: skip
+    )
     print(f"The process grew from {before / 1024:.0f} to {resident / 1024:.0f} MiB while reading lines.")
     problems = [f"{name}: {p}" for name, t in tallies.items() for p in t.problems]
     kinds = Counter(p.split(":")[0] for p in problems)

@@ -3,8 +3,8 @@
 Run as ``python -m i2rl.analysis.benchmarks.faults.journals``.
 
 A learner that needs no JAX, and whose state follows from the number of its session, commits a few sessions.
-Then it does so again in adversity. What that leaves is opened, shown, and learned on in to the end. The end
-has to be the bits of a journal that was left in peace.
+Then it does so again in adversity. The remaining journal is opened, shown, and learned on in to the end. The
+end must equal an undisturbed journal bit by bit.
 
 - Kills: SIGKILL at the first, second, ... call that writes, flushes, cuts or deletes one of the journal's
   files (``strace`` injects it), from creation to the folding in of the log. Each session is checkpointed, so
@@ -12,10 +12,10 @@ has to be the bits of a journal that was left in peace.
 - Full disks: the same with files that may grow to so many bytes only (``RLIMIT_FSIZE``), and on file systems
   of so many pages (a tmpfs, for root). Then there is room again.
 - Damage: random bits, cuts, swapped pages, noise, and rows deleted, exchanged or of other types. A damaged
-  journal is refused with :class:`JournalError`, or everything that it still shows is true.
+  journal is refused with :class:`JournalError`, or all that it shows is true.
 
-Kills and full disks are suffered by forked processes, and only afterwards is anything opened here: JAX, which
-opening a journal uses, does not outlive a fork.
+Forked processes suffer kills and full disks, and journals are opened here only afterwards: JAX, which opening
+a journal uses, does not survive a fork.
 """
 
 from __future__ import annotations
@@ -79,12 +79,12 @@ class Counter:
     name, signature, mdp, configuration = "counter", "s" * 64, _Anywhere(), {"size": 1500}
 
     def init(self, key: Any) -> CounterState:
-        """The state before the first session."""
+        """Return the state before the first session."""
         del key
         return self.after(0)
 
     def after(self, session: int) -> CounterState:
-        """The state after so many sessions."""
+        """Return the state after so many sessions."""
         return CounterState(np.arange(2.0) * session, np.arange(1500.0) + session, session)
 
 
@@ -102,12 +102,12 @@ def learn(path: Path, sessions: int, committed: Callable[[int], object] = lambda
 
 
 def told(content: Content) -> list[tuple]:
-    """What a journal holds, without the clock."""
+    """Return a journal's content without the clock."""
     return [*content.sessions, *content.state]
 
 
 class Left(NamedTuple):
-    """What was done to a journal, the file that this left, and the sessions that were committed by then."""
+    """Damage of a journal, the file that it left, and the sessions that were committed by then."""
 
     case: str
     path: Path
@@ -116,7 +116,7 @@ class Left(NamedTuple):
 
 
 class Outcome(NamedTuple):
-    """What was done to a journal, what became of it, and what was wrong with that (nothing if empty)."""
+    """Damage of a journal, the result, and its fault (empty if there is none)."""
 
     case: str
     result: str
@@ -185,7 +185,7 @@ class _Tally:
         os.write(self._writing, b".")
 
     def total(self) -> int:
-        """The count; only once."""
+        """Return the count; only once."""
         os.close(self._writing)
         with open(self._reading, "rb") as pipe:
             return len(pipe.read())
@@ -298,7 +298,7 @@ SQL_DAMAGE = (
     "ALTER TABLE {table} RENAME TO elsewhere",
     "PRAGMA user_version = {b}",
     "PRAGMA application_id = {size}",
-)  # fmt: skip
+)
 _COLUMNS = ("committed", "records", "digest", "demonstration", "state", "chain", "weights", "report")
 _ORIGINS = ("''", "'{}'", "'[1]'", "'null'", "printf('%.*c', 100000, '[')", "'{\"method\": 1}'")
 
@@ -322,11 +322,14 @@ def _damage(path: Path, rng: np.random.Generator, sessions: int) -> str:
     else:
         a, b = (int(i) for i in rng.integers(1, sessions + 1, 2))
         statements = str(rng.choice(SQL_DAMAGE)).format(
-            a=a, b=b, column=rng.choice(_COLUMNS),
+            a=a,
+            b=b,
+            column=rng.choice(_COLUMNS),
             of_state=rng.choice(["session", "sessions", "chain", "tree"]),
-            table=rng.choice(["session", "state", "origin", "writer"]), size=int(rng.integers(0, 20_000)),
+            table=rng.choice(["session", "state", "origin", "writer"]),
+            size=int(rng.integers(0, 20_000)),
             text=rng.choice(_ORIGINS),
-        )  # fmt: skip
+        )
         connection = sqlite3.connect(path)
         connection.executescript(statements)
         connection.close()
@@ -348,7 +351,7 @@ def damaged(folder: Path, count: int = 2000, seed: int = 0, sessions: int = 20) 
 
 
 def _judged(path: Path, end: Content, sessions: int) -> tuple[str, str]:
-    """What becomes of a damaged journal that is looked at and learned on in, and what is wrong with that."""
+    """Read a damaged journal, learn on in it, and return the result and its fault."""
     shown = learned = "right"
     try:
         if content(path).sessions != end.sessions[:sessions]:

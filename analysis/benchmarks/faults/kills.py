@@ -1,24 +1,24 @@
-"""Killed at any instant, ``i2rl learn`` loses nothing: python -m i2rl.analysis.benchmarks.faults.kills.
+"""Kills of ``i2rl learn`` at any instant, without loss: python -m i2rl.analysis.benchmarks.faults.kills.
 
 A stream is learned from start to end several times over, each time (a life) into a journal of its own. The
 process is killed with SIGKILL again and again and started again with the same command, until the stream is
-learned. In the end every journal has to hold the bits of one that was written without interruption, and
-after each kill a copy of what is on disk has to hold whole sessions, all that were reported among them, with
-those very bits.
+learned. In the end every journal has to hold the bits of one that was written without interruption, and after
+each kill a copy of the files on disk has to hold whole sessions, all printed ones among them, with the same
+bits.
 
 A kill at a uniformly random time would nearly always hit the start, which takes seconds where a session takes
 milliseconds. So a life's kills are shared out over the phases, and are uniform in time within each:
 
 - starting: interpreter, imports, opening the journal, loading compiled code;
 - compiling: as a first run does, without the cache of compiled code that the other starts share;
-- sessions: at most two sessions' time after a random session, so that planning, solving, committing and
-  reporting are all met as often as they take time;
-- closing: after the last session, and once more in a run that finds nothing left to do.
+- sessions: at most two sessions' time after a random session, so that kills meet planning, solving,
+  committing and printing in proportion to their time;
+- closing: after the last session, and once more in a run without remaining sessions.
 
 Processes may be forked from one that has imported everything: a kill then costs about half of the time, and
 none of them meets the imports, during which no file is open.
 
-A kill ends the process and not the system: what power loss leaves is SQLite's matter and not measured here.
+A kill ends the process and not the system: power loss is SQLite's concern and not measured here.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ ATTEMPTS = 4
 
 
 class Instant(NamedTuple):
-    """When to kill: ``seconds`` after the start, or ``delay`` after as many reports."""
+    """Instant of a kill: ``seconds`` after the start, or ``delay`` after as many lines of output."""
 
     seconds: float
     reports: float
@@ -61,9 +61,9 @@ class Instant(NamedTuple):
 
 
 class Ended(NamedTuple):
-    """How a process ended: whether it was killed, its reports until then, and what it took in seconds.
+    """End of a process: whether it was killed, its lines of output until then, and its seconds.
 
-    ``first`` and ``last`` are the times of its first and last report, NaN if there was none.
+    ``first`` and ``last`` are the times of its first and last line of output, NaN if there was none.
     """
 
     killed: bool
@@ -74,7 +74,7 @@ class Ended(NamedTuple):
 
 
 class Kill(NamedTuple):
-    """One kill: the phase it was meant for, the sessions reported by this process, committed, and before it.
+    """Kill: its intended phase, the sessions printed by this process, committed, and before it.
 
     ``problem`` says in words what a copy of the journal, taken right after the kill, had wrong.
     """
@@ -89,7 +89,7 @@ class Kill(NamedTuple):
 
 
 class Survival(NamedTuple):
-    """What became of a stream that was learned under kills.
+    """Outcome of a stream that was learned under kills.
 
     Fields
     ------
@@ -109,7 +109,7 @@ class Survival(NamedTuple):
 
 
 class Content(NamedTuple):
-    """A journal in bytes: ``sessions`` (number, weights, position in the input, report), and the state."""
+    """Journal in bytes: ``sessions`` (number, weights, position in the input, info), and the state."""
 
     sessions: list[tuple]
     state: list[tuple]
@@ -119,7 +119,7 @@ NEVER = Instant(np.inf, np.inf, 0.0)
 
 
 def content(path: Path) -> Content:
-    """Everything in a journal but the clock's readings, in bytes."""
+    """Return everything in a journal but the clock's times, in bytes."""
     with Journal.read(path) as view:
         sessions = [
             (
@@ -142,7 +142,7 @@ def _arrays(leaves: Mapping[str, Any]) -> Iterator[tuple[str, np.ndarray]]:
 
 
 class Started(Protocol):
-    """A learner that runs: what it prints, a line a session, and the power to kill it."""
+    """Running learner: its output, a line a session, and a handle to kill it."""
 
     @property
     def output(self) -> int:
@@ -200,18 +200,20 @@ def _cache(folder: Path) -> dict[str, Any]:
 
 
 class Forks:
-    """Processes forked from one that has imported everything, and has computed nothing."""
+    """Processes forked from one that has imported everything, before any computation."""
 
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._server = subprocess.Popen(
             [sys.executable, "-m", f"{__package__}.kills", "--serve", str(folder)],
-            stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
             env={k: v for k, v in os.environ.items() if not k.startswith("JAX_")},
-        )  # fmt: skip
+        )
 
     def start(self, arguments: Sequence[str], cached: bool) -> Started:
-        """As :data:`Start` says; one at a time."""
+        """Start as :data:`Start` says; one process at a time."""
         pipe = self._folder / "pipe"
         pipe.unlink(missing_ok=True)
         os.mkfifo(pipe)
@@ -257,7 +259,7 @@ def _serve(folder: Path) -> None:
         arguments, cached = json.loads(request)
         if pid := os.fork():
             print(pid, flush=True)
-            sys.stdin.readline()  # until nobody kills it any more: its number is its own until it is reaped
+            sys.stdin.readline()  # until the last kill: its number is its own until it is reaped
             print(os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]), flush=True)
             continue
         _become(folder, arguments, cached)
@@ -411,7 +413,7 @@ def _survive(
 
 
 def _copied(journal: Path, folder: Path) -> Content:
-    """What is on disk, read from a copy, so that the next process itself meets what the kill left."""
+    """Read the files on disk from a copy, so that the next process itself meets the state after the kill."""
     copy = folder / "copy.db"
     for suffix in ("", "-wal", "-shm", "-journal"):
         copy.with_name(copy.name + suffix).unlink(missing_ok=True)
@@ -424,7 +426,7 @@ def _copied(journal: Path, folder: Path) -> Content:
 
 
 def _begun(path: Path) -> bool:
-    """Whether the journal's tables are there: the process may have been killed before it had made them."""
+    """Test whether the journal's tables exist: the kill may have come before they were made."""
     connection = sqlite3.connect(path)
     try:
         return bool(connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0])
@@ -446,7 +448,9 @@ def _problem(found: Content, peace: Content, before: int, reports: int) -> str:
 
 
 def _table(kills: Sequence[Kill], sessions: int) -> list[tuple]:
-    """By phase: where the kills hit, how many between commit and report, and sessions committed by then."""
+    """Tabulate by phase: where the kills hit, how many between commit and output, and sessions committed by
+    then.
+    """
     rows: list[tuple] = []
     for phase in PHASES:
         these = [k for k in kills if k.phase == phase]
@@ -485,7 +489,7 @@ def main() -> None:
         simulate = [*cli, "simulate", "patrol", "--instance", "2", "--sessions", str(options.sessions)]
         with stream.open("w") as file:
             subprocess.run(simulate, stdout=file, check=True)
-        arguments = ["--mdp", "patrol2", "--agent", "0", "--demos", str(stream)]
+        arguments = ["--mdp", "patrol2", "--agent", "0", "--demonstrations", str(stream)]
         survival = survive(arguments, folder, options.kills, seed=options.seed, forked=options.forked)
     kills, sessions = survival.kills, survival.sessions
     columns = ("meant for", "kills", "no new session", "mid-stream", "all learned", "unreported", "sessions")

@@ -1,4 +1,4 @@
-"""What is learned does not depend on the units of the features.
+"""Independence of learning from the units of the features.
 
 Run as ``python -m i2rl.analysis.benchmarks.faults.units``.
 
@@ -77,19 +77,19 @@ def process() -> TabularMDP:
 
 
 def in_units(units: Float[np.ndarray, " K"]) -> TabularMDP:
-    """The same process, each feature times a factor."""
+    """Return the same process, each feature times a factor."""
     return replace(process(), features=process().features * units)
 
 
 @jax.jit
 def policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """The soft policy of weights."""
+    """Compute the soft policy of weights."""
     return soft_plan(mdp, reward_of(mdp, weights)).policy
 
 
 @jax.jit
 def greedy_policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """The Boltzmann policy of weights."""
+    """Compute the Boltzmann policy of weights."""
     return jnp.exp(boltzmann_log_policy(mdp, weights))
 
 
@@ -102,7 +102,7 @@ def demonstration(sensor: str = "clear") -> Demonstration:
 
 
 def target(mdp: TabularMDP) -> FeatureTarget:
-    """What the expert's policy collects."""
+    """Compute the features that the expert's policy collects."""
     expert = policy(mdp, jnp.asarray(TRUTH / feature_scale(mdp)))
     return FeatureTarget(feature_expectations(mdp, expert), mdp.initial)
 
@@ -139,12 +139,19 @@ METHODS: Mapping[str, Callable[[TabularMDP], Array | np.ndarray]] = {
     "DualProgram": lambda mdp: DualProgram(mdp).solve(target(mdp), SLACK, 0.1).weights,
     "CountProgram": lambda mdp: CountProgram(mdp).solve(counts(), 20 * SLACK, 0.1).weights,
     "PrimalProgram": lambda mdp: PrimalProgram(mdp).solve(target(mdp), SLACK).weights,
-    "MinMaxProgram": lambda mdp: MinMaxProgram(mdp, 2, 6).solve(
-        np.random.default_rng(0).poisson(4.0, (6, 4, 3)), 1.0, 0.1, 0.1, weights=_starts(mdp)
-    ).weights,
-    "fit_weights": lambda mdp: fit_weights(
-        mdp, 5, np.asarray(expected_features(mdp, jnp.asarray(TRUTH / feature_scale(mdp)), 5)), tolerance=1e-9
-    ).weights,
+    "MinMaxProgram": lambda mdp: (
+        MinMaxProgram(mdp, 2, 6)
+        .solve(np.random.default_rng(0).poisson(4.0, (6, 4, 3)), 1.0, 0.1, 0.1, weights=_starts(mdp))
+        .weights
+    ),
+    "fit_weights": lambda mdp: (
+        fit_weights(
+            mdp,
+            5,
+            np.asarray(expected_features(mdp, jnp.asarray(TRUTH / feature_scale(mdp)), 5)),
+            tolerance=1e-9,
+        ).weights
+    ),
     "darko_i2rl": _learned(lambda mdp: darko_i2rl(mdp, radius=2.0)),
     "jin_i2rl_with_features": _learned(jin_i2rl_with_features),
     "mme_mtirl": _learned(lambda mdp: mme_mtirl(mdp, n_components=2, restarts=1, slack=0.01)),
@@ -175,10 +182,10 @@ METHODS: Mapping[str, Callable[[TabularMDP], Array | np.ndarray]] = {
     "rimeo": _learned(lambda mdp: rimeo(mdp, PREDICATES, scores="none"), "noisy"),
     "rimeo ipopt": _learned(lambda mdp: rimeo(mdp, PREDICATES, scores="none", solver="ipopt"), "noisy"),
     "rifom": _learned(lambda mdp: rifom(mdp, PREDICATES, slack=0.01), "noisy"),
-}  # fmt: skip
+}
 # Greedy experts, whose policy is not the soft one.
 GREEDY = ("mlirl", "em_mlirl", "dpm_birl", "birl", "jin_i2rl_with_features")
-# Samplers magnify the least difference: their units are powers of two, which round nothing.
+# Samplers magnify the least difference: their units are powers of two, which are exact.
 SAMPLERS = ("dpm_birl", "birl")
 
 
@@ -192,13 +199,13 @@ def units_of(name: str, number: int, seed: int = 0) -> Float[np.ndarray, "number
 
 
 def policies(mdp: TabularMDP, weights: Array | np.ndarray, name: str = "") -> Float[np.ndarray, "D S A"]:
-    """The policy of each row of weights, as the method understands its experts."""
+    """Compute the policy of each row of weights under the method's model of experts."""
     of = greedy_policy if name in GREEDY else policy
     return np.stack([of(mdp, jnp.asarray(row)) for row in np.asarray(weights).reshape(-1, 3)])
 
 
 class Difference(NamedTuple):
-    """What units changed: the largest difference of a policy, and of a weight relative to the largest."""
+    """Effect of units: the largest difference of a policy, and of a weight relative to the largest."""
 
     policy: float
     weight: float
@@ -230,9 +237,12 @@ def random_process(seed: int, kind: str) -> TabularMDP:
     if kind == "duplicate":
         features[..., 2] = features[..., 0]
     mdp = TabularMDP.from_successors(
-        rng.integers(0, 10, (10, 3, 3)), rng.dirichlet(np.ones(3), (10, 3)), features,
-        initial=rng.dirichlet(np.ones(10)), discount=(0.9, 0.95, 0.99)[seed % 3],
-    )  # fmt: skip
+        rng.integers(0, 10, (10, 3, 3)),
+        rng.dirichlet(np.ones(3), (10, 3)),
+        features,
+        initial=rng.dirichlet(np.ones(10)),
+        discount=(0.9, 0.95, 0.99)[seed % 3],
+    )
     return mdp.without_inflow()
 
 

@@ -121,14 +121,14 @@ def main() -> None:
     """Run both sides and print the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--peer-python", default=None, help="interpreter that has imitation")
-    parser.add_argument("--seeds", type=int, default=5)
+    parser.add_argument("--replications", type=int, default=5)
     arguments = parser.parse_args()
     peer = Peer(arguments.peer_python) if arguments.peer_python else None
     results: dict[str, Any] = {"ours": sys.version.split()[0], "peer": peer.versions if peer else None}
     with tempfile.TemporaryDirectory() as folder:
-        results["hopper"] = _compare(_hopper(), HOPPER, peer, Path(folder), arguments.seeds)
+        results["hopper"] = _compare(_hopper(), HOPPER, peer, Path(folder), arguments.replications)
         results["cart_pole"] = _compare(
-            _cart_pole(), CART_POLE, peer, Path(folder), arguments.seeds, learning_rate=3e-3
+            _cart_pole(), CART_POLE, peer, Path(folder), arguments.replications, learning_rate=3e-3
         )
     if peer:
         peer.close()
@@ -169,7 +169,7 @@ def _hopper() -> tuple[PPO, Episodes]:
 
 
 def _cart_pole() -> tuple[PPO, Episodes]:
-    """The demonstrator is our PPO's policy after 60,000 steps by the true reward."""
+    """Train the demonstrator: our PPO's policy after 60,000 steps by the true reward."""
     settings = {"n_envs": CART_POLE.n_envs, "n_steps": CART_POLE.n_steps, "learning_rate": 1e-3}
     agent = ppo(cart_pole(), scale_rewards=True, **settings)
     state, _ = agent.train(agent.init(jax.random.key(0)), 60_000)

@@ -55,7 +55,7 @@ _ONE_THREAD = {
 
 
 def random_problem(n_states: int, seed: int, tolerance: float) -> dict[str, np.ndarray]:
-    """A random process and the exact visits of the soft expert of a standard-normal state reward."""
+    """Draw a random process and the exact visits of the soft expert of a standard-normal state reward."""
     rng = np.random.default_rng(seed)
     rows = n_states * N_ACTIONS
     successors = np.array([rng.choice(n_states, WIDTH, replace=False) for _ in range(rows)])
@@ -190,9 +190,9 @@ def compare(
 ) -> dict[str, Any]:
     """Run both sides in turn on ``problems`` random problems of one size.
 
-    Our first run on each problem is kept apart: on the first problem it compiles everything, on the others
-    what depends on their padding. Raises ``RuntimeError`` if any run misses the tolerance: a time to
-    another gap would mean nothing.
+    Our first run on each problem counts separately: on the first problem it compiles everything, on the
+    others what depends on their padding. Raises ``RuntimeError`` if any run misses the tolerance: times to
+    different gaps are not comparable.
     """
     runs: dict[str, list[dict[str, float]]] = {"ours_first": [], "ours": [], "peer": []}
     for seed in range(problems):

@@ -1,6 +1,6 @@
 """AIRL by the ``imitation`` library, one request a line, in an interpreter that has it.
 
-Imports nothing of this package. A request is JSON: ``env``, ``demonstrations`` (an ``.npz`` with arrays
+It is independent of this package. A request is JSON: ``env``, ``demonstrations`` (an ``.npz`` with arrays
 ``observations [n, L + 1, d]`` and ``actions [n, L, ...]``), ``n_envs``, ``n_steps``, ``rounds``, ``updates``,
 ``batch``, ``seed``. The answer is one JSON line: seconds of ``AIRL.train`` and the mean return of ten
 deterministic episodes after it.

@@ -1,8 +1,8 @@
 """Tabular MCE IRL by the ``imitation`` library, on problems handed over as files.
 
-Runs under the interpreter that has ``imitation`` and imports nothing of this package: one request a line
-on standard input, ``problem.npz result.npz``, one JSON line of timings on standard output. The result holds
-the policy ``[T, S, A]`` that ``MCEIRL`` returns.
+It runs under the interpreter that has ``imitation``, independent of this package: one request a line on
+standard input, ``problem.npz result.npz``, one JSON line of timings on standard output. The result holds the
+policy ``[T, S, A]`` that ``MCEIRL`` returns.
 """
 
 import json
@@ -38,7 +38,7 @@ def main() -> None:
             initial_state_dist=problem["initial"],
         )
         torch.manual_seed(int(problem["seed"]))
-        # No hidden layer: a linear reward, one weight a state (and a constant that changes nothing).
+        # No hidden layer: a linear reward, one weight a state (and a constant without effect).
         reward = reward_nets.BasicRewardNet(
             env.observation_space,
             spaces.Discrete(n_actions),

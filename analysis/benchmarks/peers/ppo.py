@@ -5,13 +5,13 @@ a table and writes every run to ``build/bench/ppo_peer.json``.
 
 Each side steps its own environments: ours the compiled cart-pole and MuJoCo's rollout of Hopper-v5, the peer
 Gymnasium's CartPole-v1 and Hopper-v4 (which differs by the one point for being healthy, which it pays in the
-step of a fall, too). Of each seed three mean returns: of all episodes of training, which says how
-quickly it went; of the last hundred of these; and of the policy's mode, in episodes of its own afterwards.
-The interval is of the mean over seeds, by Student's t at 95 %; Welch's, of the difference of the two means.
+step of a fall, too). Each seed has three mean returns: of all episodes of training, which measures its speed;
+of the last hundred of these; and of the policy's mode, in separate episodes afterwards. The interval is of
+the mean over seeds, by Student's t at 95 %; Welch's, of the difference of the two means.
 
 Each side runs in a process of its own, with one thread, pinned to one core, and the runs alternate. Ours is
-timed once compiled (what compiling takes is reported beside it); the peer over ``PPO.learn``. Where the core
-is shared with other work, the seconds of the processor tell more than those of the wall.
+timed once compiled (compilation is listed beside it); the peer over ``PPO.learn``. If the core is shared with
+other work, processor seconds are more reliable than wall seconds.
 """
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ class Trainer(Side):
     """A contestant that trains an agent for each request."""
 
     def train(self, request: dict[str, Any]) -> dict[str, float]:
-        """Returns and seconds of one agent."""
+        """Train one agent; return its returns and seconds."""
         assert self._process.stdin is not None
         self._process.stdin.write(json.dumps(request) + "\n")
         self._process.stdin.flush()
@@ -143,7 +143,7 @@ def difference(ours: list[float], peers: list[float]) -> tuple[float, float]:
 
 
 def compare(ours: Trainer, peer: Trainer, name: str, seeds: int) -> dict[str, Any]:
-    """Both sides on one task, in turn."""
+    """Run both sides on one task, in turn."""
     task = TASKS[name]
     runs: dict[str, list[dict[str, float]]] = {"ours": [], "peer": []}
     for seed in range(seeds):
@@ -185,7 +185,7 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--tasks", nargs="+", choices=TASKS, default=list(TASKS))
-    parser.add_argument("--seeds", type=int, default=5, help="agents of each side on each task")
+    parser.add_argument("--replications", type=int, default=5, help="agents of each side on each task")
     parser.add_argument("--peer-python", type=Path, default=Path(".venv-peers/bin/python"))
     parser.add_argument("--output", type=Path, default=Path("build/bench/ppo_peer.json"))
     parser.add_argument("--serve", action="store_true", help=argparse.SUPPRESS)
@@ -193,8 +193,8 @@ def main() -> None:
     if options.serve:
         serve()
         return
-    if options.seeds < 2:
-        parser.error(f"an interval needs two seeds or more, got {options.seeds}")
+    if options.replications < 2:
+        parser.error(f"an interval needs two seeds or more, got {options.replications}")
     if not options.peer_python.exists():
         parser.error(f"no interpreter at {options.peer_python}: `make bench-peers` prepares one")
     # taskset and CPU affinity are Linux's; elsewhere the single thread has to do.
@@ -203,7 +203,7 @@ def main() -> None:
         folder, script = Path(name), Path(__file__).with_name("peer_ppo.py")
         ours = Trainer("ours", [sys.executable, "-m", __spec__.name, "--serve"], folder, core)
         peer = Trainer("peer", [str(options.peer_python.absolute()), str(script)], folder, core)
-        rows = [compare(ours, peer, task, options.seeds) for task in options.tasks]
+        rows = [compare(ours, peer, task, options.replications) for task in options.tasks]
         for side in (ours, peer):
             side.close()
     columns = ["task", "steps", "returns", "i2rl", "peer", "difference"]
@@ -219,7 +219,7 @@ def main() -> None:
         for row in rows
         for kind, of in row["returns"].items()
     ]
-    print_table(f"PPO and Stable-Baselines3's, {options.seeds} seeds, 95 % intervals", columns, table)
+    print_table(f"PPO and Stable-Baselines3's, {options.replications} seeds, 95 % intervals", columns, table)
     columns = ["task", "seconds", "peer's", "ratio", "of the processor", "peer's", "ratio", "first round"]
     table = [
         (

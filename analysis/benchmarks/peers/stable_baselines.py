@@ -1,7 +1,7 @@
 """PPO by Stable-Baselines3, trained as asked for.
 
-Runs under the interpreter that has ``stable_baselines3`` and imports nothing of this package: one request a
-line on standard input (JSON), one JSON line of returns and timings on standard output.
+It runs under the interpreter that has ``stable_baselines3``, independent of this package: one request a line
+on standard input (JSON), one JSON line of returns and timings on standard output.
 """
 
 import json

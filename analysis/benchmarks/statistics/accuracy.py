@@ -1,9 +1,9 @@
 """Accuracy of online learning under occlusion, on the three patrols.
 
-``python -m i2rl.analysis.benchmarks.statistics.accuracy`` reports learned behaviour accuracy of LME-I2RL
-after some sessions of five steps, for every sufficient statistic, beside batch LME on the same data and the
-same accuracy of rewards drawn at random, learned from nothing: medians over seeds and patrollers, and the
-share of runs within 0.01 of batch.
+``python -m i2rl.analysis.benchmarks.statistics.accuracy`` prints learned behaviour accuracy of LME-I2RL after
+some sessions of five steps, for every sufficient statistic, beside batch LME on the same data and the same
+accuracy of random rewards: medians over replications and patrollers, and the share of replications within
+0.01 of batch.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from ..harness import print_table, publish
 
 
 def accuracies(
-    number: int, observability: int, points: tuple[int, ...], seeds: int, statistics: tuple[str, ...]
-) -> dict[str, Float[np.ndarray, "runs points"]]:
+    number: int, observability: int, points: tuple[int, ...], replications: int, statistics: tuple[str, ...]
+) -> dict[str, Float[np.ndarray, "replications points"]]:
     """LBA of each method at each number of sessions; a run is a seed and a patroller."""
     patrol = instance(number)
     view = patrol.visibility(observability)
@@ -34,7 +34,7 @@ def accuracies(
     learners = {s: lme_i2rl(patrol.mdp, view, statistic=s) for s in statistics}
     batch = batch_lme(patrol.mdp, view)
     weights: dict[str, list[Any]] = {name: [] for name in (*learners, "batch", "random rewards")}
-    for seed in range(seeds):
+    for seed in range(replications):
         key = jax.random.key(seed)
         for patroller, demonstration in enumerate(demonstrate(key, patrol, observability, max(points))):
             start = jax.random.fold_in(key, patroller)
@@ -46,16 +46,17 @@ def accuracies(
             random = jax.random.uniform(start, (len(points), patrol.mdp.n_features), float, -0.99, 0.99)
             weights["random rewards"].append(random)
     return {
-        name: np.asarray(score(jnp.asarray(np.array(w)).reshape(-1, patrol.mdp.n_features)).accuracy.overall)
-        .reshape(-1, len(points))
+        name: np.asarray(
+            score(jnp.asarray(np.array(w)).reshape(-1, patrol.mdp.n_features)).accuracy.overall
+        ).reshape(-1, len(points))
         for name, w in weights.items()
-    }  # fmt: skip
+    }
 
 
 def main() -> None:
     """Run and publish."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=10)
+    parser.add_argument("--replications", type=int, default=10)
     parser.add_argument("--instances", type=int, nargs="+", default=[2, 1, 3])
     options = parser.parse_args()
     settings = {1: (30, (22, 60, 230)), 2: (30, (22, 60, 239)), 3: (18, (22, 60, 230))}
@@ -63,7 +64,7 @@ def main() -> None:
     for number in options.instances:
         observability, points = settings[number]
         statistics = ("seen", "counts", "features") if number == 2 else ("seen",)
-        measured = accuracies(number, observability, points, options.seeds, statistics)
+        measured = accuracies(number, observability, points, options.replications, statistics)
         rows, summary = [], {}
         for name, values in measured.items():
             close = np.mean(values >= measured["batch"] - 0.01, axis=0)
@@ -84,8 +85,8 @@ def main() -> None:
                     ),
                 )
             )
-        runs = f"{options.seeds} seeds, each patroller"
-        title = f"LBA, patrol {number}, {observability} % in view, median (least) of {runs}"
+        replications = f"{options.replications} replications, each patroller"
+        title = f"LBA, patrol {number}, {observability} % in view, median (least) of {replications}"
         print_table(title, ("statistic or method", *(f"{n} sessions" for n in points)), rows)
         results[f"patrol{number}"] = summary
     publish("accuracy", results)

@@ -1,17 +1,17 @@
-"""AIRL on patrol through reports that err, and GAIL on patrol through a view that hides (7.4.3 and 7.4.1).
+"""AIRL on patrol with noisy observations, and GAIL on patrol with hidden steps (7.4.3 and 7.4.1).
 
 ``python -m i2rl.analysis.benchmarks.statistics.adversarial_patrol`` writes
 ``build/bench/adversarial_patrol.json`` and, beside it, figures (``patrol-view`` is to be seen beside Figure
 7.4(c)):
 
 - *noise*: instance 2, its greedy expert (the dissertation's is a rule by hand), trajectories of 8 pairs from
-  anywhere, sessions of 32 to 128 pairs. Moving forward is reported as turning left, and turning right as
-  moving forward; states are never wrong. LBA after every session of AIRL on the truth, of AIRL and
-  robust-AIRL on the reports, with the sensor given or learned, and of LME-I2RL on the same reports, which
-  knows the six features that the expert's reward is made of. AIRL learners with and without memory of
-  earlier sessions. How often each final policy leads past the patrollers unseen.
+  anywhere, sessions of 32 to 128 pairs. Moving forward is observed as turning left, and turning right as
+  moving forward; states are always right. LBA after every session of AIRL on the truth, of AIRL and
+  robust-AIRL on the observations, with the sensor given or learned, and of LME-I2RL on the same observations,
+  with the six features of the expert's reward. AIRL learners with and without memory of earlier sessions.
+  Success of each final policy in passing the patrollers undetected.
 - *view*: the same patrol, sessions of one trajectory of 5 pairs for each patroller, at three degrees of
-  observability; online GAIL on what was seen, GAIL on the posterior of what was hidden too, and LME-I2RL.
+  observability; online GAIL on the steps seen, GAIL on the posterior of the hidden steps too, and LME-I2RL.
 
 Parts and methods that the file already holds are not measured again.
 """
@@ -69,9 +69,11 @@ VIEWS = (100, 70, 30)
 WINDOW = 5
 
 
-def view_streams(patrol: Patrol, view: int, runs: int, sessions: int, seed: int = 0) -> Demonstration:
-    """Windows of both patrollers of each run, ``[runs * patrollers, sessions, 1, WINDOW]``."""
-    keys = jax.random.split(jax.random.key(seed), runs)
+def view_streams(patrol: Patrol, view: int, replications: int, sessions: int, seed: int = 0) -> Demonstration:
+    """Simulate windows of both patrollers of each replication, ``[replications * patrollers, sessions, 1,
+    WINDOW]``.
+    """
+    keys = jax.random.split(jax.random.key(seed), replications)
     rows = [d for key in keys for d in demonstrate(key, patrol, view, sessions, WINDOW)]
     return jax.tree.map(lambda *parts: np.stack(parts)[:, :, None], *rows)
 
@@ -96,7 +98,7 @@ class _File:
 
 
 def _timed(patrol: Patrol, learner: Learner, streams: Demonstration) -> tuple[Outcome, float]:
-    """All streams of a learner, and the seconds they took, compilation included."""
+    """Run all streams of a learner; return the seconds they took, compilation included."""
     found: list[Outcome] = []
     took = seconds(lambda: found.append(outcome_of(patrol, learner, streams)))
     return found[0], took
@@ -122,19 +124,20 @@ def noise_methods(
 def noise_study(
     file: _File,
     *,
-    runs: int,
+    replications: int,
     few: int,
     sessions: int,
     trials: int,
     levels: Sequence[float],
     iterations: int,
 ) -> None:
-    """Every method at the first level; at the others, on ``few`` runs, what shows the cost of noise.
+    """Run every method at the first level; at the others, on ``few`` replications, the methods that show the
+    cost of noise.
 
     AIRL learners with and without memory of earlier sessions.
     """
     patrol = instance(2)
-    true = np.broadcast_to(patrol.expert_policy(), (runs, *patrol.expert_policy().shape))
+    true = np.broadcast_to(patrol.expert_policy(), (replications, *patrol.expert_policy().shape))
 
     def with_the_true_policy() -> dict[str, Any]:
         success = success_rates(patrol, true, trials)
@@ -152,11 +155,11 @@ def noise_study(
             for name in (NOISY, ROBUST)
         ),
         *((first, name, 0.0) for name in (LEARNED, LOGITS, GIBBS)),
-    ]  # fmt: skip
-    streams_of = cache(partial(noisy_streams, patrol, runs=runs, sessions=sessions))
+    ]
+    streams_of = cache(partial(noisy_streams, patrol, replications=replications, sessions=sessions))
     for level, name, forgetting in jobs:
         everything = level == first and name not in (GIBBS, LOGITS)
-        count, tried = (runs, trials) if everything else (min(few, runs), 0)
+        count, tried = (replications, trials) if everything else (min(few, replications), 0)
         streams = streams_of(level)
         make, seen = noise_methods(streams, patrol)[name]
         learner = make(forgetting=forgetting, iterations=iterations)
@@ -174,23 +177,29 @@ def noise_study(
             found, took = _timed(patrol, learner, own)
             success = success_rates(patrol, found.policies, tried) if tried else np.zeros(0)
             return {
-                "name": name, "level": level, "forgetting": forgetting, "seconds": took,
-                "final": float(found.accuracy[:, -LAST:].mean()), "trials": tried,
+                "name": name,
+                "level": level,
+                "forgetting": forgetting,
+                "seconds": took,
+                "final": float(found.accuracy[:, -LAST:].mean()),
+                "trials": tried,
                 "success mean": float(success.mean()) if tried else None,
-                "pairs": pairs.tolist(), "accuracy": found.accuracy.round(5).tolist(),
-                "success": success.tolist(), "noise": found.noise.round(5).tolist(),
-            }  # fmt: skip
+                "pairs": pairs.tolist(),
+                "accuracy": found.accuracy.round(5).tolist(),
+                "success": success.tolist(),
+                "noise": found.noise.round(5).tolist(),
+            }
 
         file.measure("noise", f"{name}, {level:g}, memory {forgetting:g}", action)
 
 
-def view_study(file: _File, *, runs: int, sessions: int, iterations: int) -> None:
+def view_study(file: _File, *, replications: int, sessions: int, iterations: int) -> None:
     """GAIL and LME-I2RL at three degrees of observability."""
     patrol = instance(2)
     mdp = patrol.mdp
     options: dict[str, Any] = {"iterations": iterations, "updates": 5, "horizon": 8, **GAIL_OPTIONS}
     for view in VIEWS:
-        seen = view_streams(patrol, view, runs, sessions)
+        seen = view_streams(patrol, view, replications, sessions)
         visibility = patrol.visibility(view)
         learners = [
             (LME, 1.0, lme_i2rl(mdp, visibility)),
@@ -209,10 +218,13 @@ def view_study(file: _File, *, runs: int, sessions: int, iterations: int) -> Non
             ) -> dict[str, Any]:
                 found, took = _timed(patrol, learner, seen)
                 return {
-                    "name": name, "view": view, "forgetting": forgetting, "seconds": took,
+                    "name": name,
+                    "view": view,
+                    "forgetting": forgetting,
+                    "seconds": took,
                     "final": float(found.accuracy[:, -1].mean()),
                     "accuracy": found.accuracy.round(5).tolist(),
-                }  # fmt: skip
+                }
 
             file.measure("view", f"{name}, {view} %, memory {forgetting:g}", action)
 
@@ -230,8 +242,9 @@ def _print(results: Mapping[str, Any]) -> None:
         rows.append((key, len(r["accuracy"]), float(final), float(half), *breach))
     print_table(
         "Reports that err: LBA, mean of the last 15 sessions; breaches that succeed",
-        ("method, noise", "runs", "LBA", "+-", "success", "+-"), rows,
-    )  # fmt: skip
+        ("method, noise", "replications", "LBA", "+-", "success", "+-"),
+        rows,
+    )
     rows = []
     for key, r in results.get("view", {}).items():
         mean, half = interval(np.array(r["accuracy"])[:, -1])
@@ -243,8 +256,10 @@ def main() -> None:
     """Measure, print and write."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("--part", choices=("noise", "view", "all"), default="all")
-    parser.add_argument("--runs", type=int, default=20)
-    parser.add_argument("--few", type=int, default=8, help="runs of other levels, and of slow variants")
+    parser.add_argument("--replications", type=int, default=20)
+    parser.add_argument(
+        "--few", type=int, default=8, help="replications of other levels, and of slow variants"
+    )
     parser.add_argument("--sessions", type=int, default=35)
     parser.add_argument("--view-sessions", type=int, default=100)
     parser.add_argument("--trials", type=int, default=40)
@@ -255,12 +270,20 @@ def main() -> None:
     file = _File(given.out)
     if given.part != "view":
         noise_study(
-            file, runs=given.runs, few=given.few, sessions=given.sessions, trials=given.trials,
-            levels=given.levels, iterations=given.iterations,
-        )  # fmt: skip
+            file,
+            replications=given.replications,
+            few=given.few,
+            sessions=given.sessions,
+            trials=given.trials,
+            levels=given.levels,
+            iterations=given.iterations,
+        )
     if given.part != "noise":
         view_study(
-            file, runs=max(given.runs // 4, 1), sessions=given.view_sessions, iterations=given.iterations
+            file,
+            replications=max(given.replications // 4, 1),
+            sessions=given.view_sessions,
+            iterations=given.iterations,
         )
     _print(file.results)
     for path in write_figures(file.results, given.out.parent):

@@ -71,7 +71,7 @@ class Uniformity(NamedTuple):
 
 
 def small_world() -> Setting:
-    """Five states on a ring, two ways round and a rest, two states of it out of view, three features."""
+    """Build a ring of five states, both directions and a rest, two states out of view, three features."""
     n_states, slip = 5, 0.2
     state = np.arange(n_states)
     moves = np.stack([(state + 1) % n_states, (state - 1) % n_states, state], axis=1)
@@ -98,9 +98,9 @@ def rank_statistics(
 ) -> Ranks:
     """Replicate prior draw, simulation and posterior; every replication in one compiled program.
 
-    ``draws`` are kept of each posterior, every ``thin``-th of its chain so that they are close to
-    independent. Quantities: every weight; the demonstration's log-likelihood; the steps that the expert
-    spent in the last state (out of view in :func:`small_world`).
+    Each posterior gives ``draws``, every ``thin``-th of its chain so that they are close to independent.
+    Quantities: every weight; the demonstration's log-likelihood; the steps that the expert spent in the last
+    state (out of view in :func:`small_world`).
     """
     setting = small_world() if setting is None else setting
     ranks, diverging = _replicate(

@@ -1,4 +1,4 @@
-"""Several ways of doing a task: online against batch, a way that comes late, hidden steps, experts who err.
+"""Several behaviours of a task: online against batch, a late component, hidden steps, experts who err.
 
 ``python -m i2rl.analysis.benchmarks.statistics.n_components`` measures MME-MTIRL on onion sorting (26 states,
 ``D = 4``):
@@ -10,7 +10,7 @@
 - *soft*: one or two experts who obey the soft model (true weights times a sharpness), ``temperature`` 0.5 and
   1.
 
-How many ways are found, value differences and run times beside the baselines: ``i2rl run sorting``.
+``i2rl run sorting`` measures numbers of components, value differences and times beside the baselines.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ STEPS = 50
 
 
 def shuffled(key: jax.Array, mixed: MixedDemonstration) -> MixedDemonstration:
-    """The same trajectories in a random order."""
+    """Return the same trajectories in a random order."""
     order = np.asarray(jax.random.permutation(key, len(mixed.labels)))
     return MixedDemonstration(mixed.demonstration.select(order), mixed.labels[order])
 
@@ -53,7 +53,7 @@ def shuffled(key: jax.Array, mixed: MixedDemonstration) -> MixedDemonstration:
 def run_online(
     learner: Learner, key: jax.Array, demonstration: Demonstration, size: int
 ) -> tuple[Any, list[Any]]:
-    """Feed sessions of ``size`` trajectories; the final state and all reports."""
+    """Feed sessions of ``size`` trajectories; return the final state and all infos."""
     state, reports = learner.init(key), []
     for session in demonstration.sessions(size):
         state, report = learner.update(state, session)
@@ -129,14 +129,18 @@ def late_component(sorting: Sorting, sessions: int, size: int, seeds: Sequence[i
         shares = assign_trajectories(
             sorting.mdp, None, weights, np.asarray(state.proportions)[present], demonstration
         )
-        records.append({
-            "seed": seed, "before": reports[early - 1].n_components, "after": reports[-1].n_components,
-            "late_trajectories": int((labels == 2).sum()),
-            "accuracy": assignment_accuracy(labels, shares.argmax(1)),
-            "evd": expected_value_difference(
-                sorting.mdp, sorting.weights, labels, weights, shares.argmax(1), demonstration
-            ),
-        })  # fmt: skip
+        records.append(
+            {
+                "seed": seed,
+                "before": reports[early - 1].n_components,
+                "after": reports[-1].n_components,
+                "late_trajectories": int((labels == 2).sum()),
+                "accuracy": assignment_accuracy(labels, shares.argmax(1)),
+                "evd": expected_value_difference(
+                    sorting.mdp, sorting.weights, labels, weights, shares.argmax(1), demonstration
+                ),
+            }
+        )
     return records
 
 
@@ -163,14 +167,18 @@ def hidden_steps(
         whole, labels = demonstrate_sorting(key, sorting, [n // tasks] * tasks, STEPS)
         seen = hide(jax.random.fold_in(key, 1), whole, share)
         took, fit = timed(batch.fit, key, seen)
-        records.append({
-            "seed": seed, "n_components": fit.n_components, "seconds": took,
-            "accuracy": assignment_accuracy(labels, fit.assignments),
-            "ari": adjusted_rand_index(labels, fit.assignments),
-            "evd": expected_value_difference(
-                sorting.mdp, sorting.weights, labels, fit.weights, fit.assignments, whole
-            ),
-        })  # fmt: skip
+        records.append(
+            {
+                "seed": seed,
+                "n_components": fit.n_components,
+                "seconds": took,
+                "accuracy": assignment_accuracy(labels, fit.assignments),
+                "ari": adjusted_rand_index(labels, fit.assignments),
+                "evd": expected_value_difference(
+                    sorting.mdp, sorting.weights, labels, fit.weights, fit.assignments, whole
+                ),
+            }
+        )
     return records
 
 
@@ -189,19 +197,26 @@ def soft_experts(
             for b, w in enumerate(sorting.weights[:tasks])
         ]
         fit = batch.fit(key, Demonstration.from_codes(np.concatenate([np.asarray(c) for c in codes])))
-        records.append({
-            "sharpness": sharpness, "tasks": tasks, "n": n, "temperature": temperature, "seed": seed,
-            "n_components": fit.n_components, "accuracy": assignment_accuracy(labels, fit.assignments),
-        })  # fmt: skip
+        records.append(
+            {
+                "sharpness": sharpness,
+                "tasks": tasks,
+                "n": n,
+                "temperature": temperature,
+                "seed": seed,
+                "n_components": fit.n_components,
+                "accuracy": assignment_accuracy(labels, fit.assignments),
+            }
+        )
     return records
 
 
 def main() -> None:
     """Run and publish."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--replications", type=int, default=20)
     options = parser.parse_args()
-    seeds, sorting = range(options.seeds), sorting_with_claiming()
+    seeds, sorting = range(options.replications), sorting_with_claiming()
     results: dict[str, Any] = {}
 
     def record(name: str, runs: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -216,13 +231,17 @@ def main() -> None:
             online_against_batch(sorting, tasks, n, size, seeds[:10]),
         )
         column = {name: np.array([run[name] for run in runs]) for name in runs[0]}
-        rows.append((
-            f"{tasks} tasks, {n} in sessions of {size}",
-            f"{np.mean(column['online_ways'] == tasks):.0%} / {np.mean(column['batch_ways'] == tasks):.0%}",
-            float(column["online_evd"].mean()), float(column["batch_evd"].mean()),
-            float(np.median(column["online_seconds"])), float(np.median(column["batch_seconds"])),
-            float(np.median(column["online_seconds"] / column["batch_seconds"])),
-        ))  # fmt: skip
+        rows.append(
+            (
+                f"{tasks} tasks, {n} in sessions of {size}",
+                " / ".join(f"{np.mean(column[f'{side}_ways'] == tasks):.0%}" for side in ("online", "batch")),
+                float(column["online_evd"].mean()),
+                float(column["batch_evd"].mean()),
+                float(np.median(column["online_seconds"])),
+                float(np.median(column["batch_seconds"])),
+                float(np.median(column["online_seconds"] / column["batch_seconds"])),
+            )
+        )
     columns = ("stream", "all ways found, online / batch", "EVD online", "EVD batch", "s online", "s batch")
     print_table("Online against batch at every session", (*columns, "ratio"), rows)
 
@@ -230,24 +249,31 @@ def main() -> None:
     print_table(
         "A third way from the last third of 18 sessions of 6 on",
         ("two before", "three after", "mean accuracy", "mean EVD"),
-        [(
-            f"{sum(run['before'] == 2 for run in runs)} of {len(runs)}",
-            f"{sum(run['after'] == 3 for run in runs)} of {len(runs)}",
-            float(np.mean([run["accuracy"] for run in runs])), float(np.mean([run["evd"] for run in runs])),
-        )],
-    )  # fmt: skip
+        [
+            (
+                f"{sum(run['before'] == 2 for run in runs)} of {len(runs)}",
+                f"{sum(run['after'] == 3 for run in runs)} of {len(runs)}",
+                float(np.mean([run["accuracy"] for run in runs])),
+                float(np.mean([run["evd"] for run in runs])),
+            )
+        ],
+    )
     rows = []
     for tasks, n in ((2, 64), (3, 96)):
         runs = record(
             f"hidden, {tasks} tasks",
             hidden_steps(sorting, tasks, n, 0.5, seeds[:10]),
         )
-        rows.append((
-            f"{tasks} tasks, {n}", f"{sum(run['n_components'] == tasks for run in runs)} of {len(runs)}",
-            float(np.mean([run["accuracy"] for run in runs])), min(run["accuracy"] for run in runs),
-            float(np.mean([run["evd"] for run in runs])),
-            float(np.median([run["seconds"] for run in runs])),
-        ))  # fmt: skip
+        rows.append(
+            (
+                f"{tasks} tasks, {n}",
+                f"{sum(run['n_components'] == tasks for run in runs)} of {len(runs)}",
+                float(np.mean([run["accuracy"] for run in runs])),
+                min(run["accuracy"] for run in runs),
+                float(np.mean([run["evd"] for run in runs])),
+                float(np.median([run["seconds"] for run in runs])),
+            )
+        )
     columns = ("trajectories", "all ways found", "mean accuracy", "least accuracy", "mean EVD", "s")
     print_table("Half of the steps hidden", columns, rows)
 
@@ -259,11 +285,13 @@ def main() -> None:
                     f"soft, sharpness {sharpness:g}, {tasks} tasks, price {temperature:g}",
                     soft_experts(sorting, sharpness, tasks, 64, temperature, seeds[:10]),
                 )
-                rows.append((
-                    f"sharpness {sharpness:g}, {tasks} tasks, price {temperature:g}",
-                    " ".join(str(run["n_components"]) for run in runs),
-                    float(np.mean([run["accuracy"] for run in runs])),
-                ))  # fmt: skip
+                rows.append(
+                    (
+                        f"sharpness {sharpness:g}, {tasks} tasks, price {temperature:g}",
+                        " ".join(str(run["n_components"]) for run in runs),
+                        float(np.mean([run["accuracy"] for run in runs])),
+                    )
+                )
     print_table("Soft experts, 64 trajectories", ("experts", "ways found, by seed", "mean accuracy"), rows)
 
 

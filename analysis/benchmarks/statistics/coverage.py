@@ -1,9 +1,9 @@
-"""Coverage and looseness of every bound, and how many trajectories each asks for.
+"""Coverage and looseness of every bound, and its number of trajectories.
 
-``python -m i2rl.analysis.benchmarks.statistics.coverage`` repeats simulated runs on a random MDP and on
-patrol 2 (an expert who obeys the soft model of the patrol's true weights), and reports in what share of them
-each bound holds, how many times larger it is than the quantile seen, and the number of trajectories that
-Theorem 2 (Theorem 4 of appendix B) and the tighter bounds need for the rows of Table 7.1(a).
+``python -m i2rl.analysis.benchmarks.statistics.coverage`` simulates replications on a random MDP and on
+patrol 2 (an expert who obeys the soft model of the patrol's true weights), and prints the share of them in
+which each bound holds, its ratio to the quantile observed, and the number of trajectories that Theorem 2
+(Theorem 4 of appendix B) and the tighter bounds need for the rows of Table 7.1(a).
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from ..harness import print_table, publish
 
 
 def random_setting(seed: int = 0, n_states: int = 12, n_actions: int = 3, n_features: int = 4) -> Setting:
-    """A random MDP of which a third is in view, its expert's weights uniform in [0, 1]."""
+    """Draw a random MDP with a third of its states in view, its expert's weights uniform in [0, 1]."""
     rng = np.random.default_rng(seed)
     successors = np.argsort(rng.random((n_states, n_actions, n_states)), axis=2)[:, :, :3]
     mdp = TabularMDP.from_successors(
@@ -81,13 +81,13 @@ def sample_sizes(setting: Setting, confidence: float = 0.8) -> pd.DataFrame:
     return table
 
 
-def planned_coverage(key: jax.Array, setting: Setting, table: pd.DataFrame, runs: int) -> list[dict]:
-    """Whether the observed bound, at the sizes planned for it, is what was planned, and covers."""
+def planned_coverage(key: jax.Array, setting: Setting, table: pd.DataFrame, replications: int) -> list[dict]:
+    """Test whether the observed bound, at the sizes planned for it, has the planned error, and covers."""
     mdp, discount = setting.mdp, float(setting.mdp.discount)
     expert, found = expert_of(mdp, setting.weights), []
     for i, row in enumerate(table.itertuples()):
         features = simulate_features(
-            jax.random.fold_in(key, i), mdp, expert, setting.length, runs, row.observed
+            jax.random.fold_in(key, i), mdp, expert, setting.length, replications, row.observed
         )
         each = [observed_bound(x, 0.8, discount) for x in np.asarray(features)]
         errors = np.array([o.bound.error for o in each])
@@ -96,20 +96,22 @@ def planned_coverage(key: jax.Array, setting: Setting, table: pd.DataFrame, runs
         )
         found.append(
             {
-                "trajectories": int(row.observed), "wanted_nats": float(row.error_nats),
-                "median_bound_nats": float(np.median(errors)), "covered": float(np.mean(gaps <= errors)),
+                "trajectories": int(row.observed),
+                "wanted_nats": float(row.error_nats),
+                "median_bound_nats": float(np.median(errors)),
+                "covered": float(np.mean(gaps <= errors)),
             }
-        )  # fmt: skip
+        )
     return found
 
 
 def main() -> None:
     """Run and publish."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=500)
+    parser.add_argument("--replications", type=int, default=500)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    key, runs = jax.random.key(options.seed), options.runs
+    key, replications = jax.random.key(options.seed), options.replications
     small, patrol, short = random_setting(), patrol_setting(500), patrol_setting(150)
     studies: tuple[tuple[Callable[..., list[Coverage]], Setting, tuple], ...] = (
         (full_view_coverage, small, (240, 0.9)),
@@ -124,7 +126,7 @@ def main() -> None:
     rows: list[Coverage] = []
     for i, (study, setting, arguments) in enumerate(studies):
         began = time.perf_counter()
-        rows += study(jax.random.fold_in(key, i), setting, runs, *arguments)
+        rows += study(jax.random.fold_in(key, i), setting, replications, *arguments)
         print(f"{study.__name__} on {setting.name}: {time.perf_counter() - began:.0f} s", flush=True)
     table = coverage_table(rows)
     print_table(
@@ -147,12 +149,12 @@ def main() -> None:
     print("Gap of knowing nothing (zero weights), nats:", ignorance)
     sizes = sample_sizes(patrol)
     Console(width=200).print(sizes.to_string())
-    planned = planned_coverage(jax.random.fold_in(key, 99), patrol, sizes, runs)
+    planned = planned_coverage(jax.random.fold_in(key, 99), patrol, sizes, replications)
     print(pd.DataFrame(planned).to_string())
     publish(
         "coverage",
         {
-            "runs": runs,
+            "replications": replications,
             "coverage": table.reset_index().to_dict("records"),
             "ignorance_gap": ignorance,
             "sample_sizes": sizes.reset_index().to_dict("records"),

@@ -1,11 +1,11 @@
-"""The truth behind a noisy pendulum by Gibbs sampling, by smoothing and by particles.
+"""Truth behind a noisy pendulum by Gibbs sampling, by smoothing and by particles.
 
 ``python -m i2rl.analysis.benchmarks.statistics.gibbs`` draws trajectories of a damped pendulum with a torque
-at four settings of process and sensor noise, among them one where the noise of the reports is large against
-that of the process and single steps hardly move. :class:`GaussianGibbs` and the smoother are compared with a
-referee that shares nothing with them: a bootstrap particle filter with backward simulation (Godsill, Doucet
-and West 2004). Differences of posterior means are in the referee's standard deviations, the largest over all
-steps and components. Fails if Gibbs differs from the referee by more than ``TOLERANCE``.
+at four settings of process and sensor noise, among them one with observation noise that is large against the
+process noise, where single steps hardly move. :class:`GaussianGibbs` and the smoother are compared with an
+independent referee: a bootstrap particle filter with backward simulation (Godsill, Doucet and West 2004).
+Differences of posterior means are in the referee's standard deviations, the largest over all steps and
+components. Fails if Gibbs differs from the referee by more than ``TOLERANCE``.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ PENDULUM, POLICY = jax_dynamics(pendulum), Torque(jnp.array([[-0.3, 0.5]]))
 
 
 def problem(seed: int, process: float, sensor: GaussianSensor, steps: int) -> Recording:
-    """Draw a trajectory from the model and report it."""
+    """Draw a trajectory from the model and its observation."""
     rng = np.random.default_rng(seed)
     s, pairs = jnp.asarray(rng.normal(size=(1, 2))), []
     for _ in range(steps):
@@ -135,7 +135,7 @@ def particle_smoother(
 
 
 def by_particles(key: Array, process: float, variance: float, reported: Recording, options: Any) -> Moments:
-    """The referee's moments."""
+    """Compute the referee's moments."""
     drawn = np.asarray(
         particle_smoother(key, POLICY, process, variance, reported, options.particles, options.backward)
     )
@@ -188,7 +188,7 @@ def compare(process: float, variance: float, seed: int, options: Any) -> dict[st
 def main() -> None:
     """Compare, print, publish, and fail where Gibbs differs by more than ``TOLERANCE``."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", 1)[0] if __doc__ else None)
-    parser.add_argument("--seeds", type=int, default=4)
+    parser.add_argument("--replications", type=int, default=4)
     parser.add_argument("--steps", type=int, default=STEPS)
     parser.add_argument("--particles", type=int, default=20_000)
     parser.add_argument("--backward", type=int, default=1500, help="trajectories of half the referee")
@@ -197,7 +197,7 @@ def main() -> None:
     options = parser.parse_args()
     rows, worst = [], 0.0
     for process, variance in SETTINGS:
-        for seed in range(options.seeds):
+        for seed in range(options.replications):
             row = {"process": process, "sensor": variance, "seed": seed}
             row |= compare(process, variance, seed, options)
             rows.append(row)

@@ -3,11 +3,11 @@
 ``python -m i2rl.analysis.benchmarks.statistics.mixture`` asks two questions of NUTS (assignments summed out)
 and of Gibbs sampling over assignments (Neal's algorithm 8):
 
-- Do they draw from the same posterior? Moments that do not depend on what the ways are called are compared
+- Do they draw from the same posterior? Moments that are invariant to the order of the components are compared
   over several mixtures, each difference in units of its Monte-Carlo standard error.
 - Is it the posterior of the declared model? Simulation-based calibration (Talts et al. 2018) of each, as
-  :mod:`~i2rl.analysis.benchmarks.statistics.calibration` does for one way: mixtures drawn from the prior
-  generate demonstrations, and the truth's rank among the draws must be uniform. The public samplers are
+  :mod:`~i2rl.analysis.benchmarks.statistics.calibration` does for one component: mixtures drawn from the
+  prior generate demonstrations, and the truth's rank among the draws must be uniform. The public samplers are
   called, their starts and output included.
 """
 
@@ -79,7 +79,7 @@ class Comparison(NamedTuple):
 
 
 class Mixtures(NamedTuple):
-    """Draws from the prior, and the ways and codes of the demonstrations that they generated."""
+    """Prior draws, and the components and codes of the demonstrations that they generated."""
 
     weights: Float[Array, "R T K"]
     proportions: Float[Array, "R T"]
@@ -100,7 +100,7 @@ class Drawn(NamedTuple):
 
 
 def small_mixture(trajectories: int, length: int, components: int = 8) -> Setting:
-    """The world that one way is calibrated in, two of its five states out of view."""
+    """Build the process of the calibration with one component, two of its five states out of view."""
     world = calibration.small_world()
     return Setting(
         world.mdp,
@@ -153,7 +153,9 @@ def draw_mixtures(key: Array, replications: int, setting: Setting, components: i
 
 
 def moments(idata: az.InferenceData) -> dict[str, Float[np.ndarray, "chain draw"]]:
-    """Draws of quantities whatever the ways are called; their means are the moments compared."""
+    """Compute draws of quantities that are invariant to the order of the components; their means are
+    compared.
+    """
     invariant, components = label_invariant(idata), idata["assignments"].assignment.values
     found = {
         f"trajectories {i} and {j} together": components[..., i] == components[..., j]
@@ -200,18 +202,22 @@ def agreement(
             data.append(sample(k, setting.mdp, setting.sensor, demonstration))
             spent = time.perf_counter() - began
             varying = [x for x in moments(data[-1]).values() if np.ptp(x) > 0]
-            mixed.append({
-                "mixture": r, "sampler": name, "seconds": spent,
-                "R-hat": max(float(az.rhat(x)) for x in varying),
-                "ESS": min(float(az.ess(x, method="mean")) for x in varying),
-                "components": float(data[-1]["assignments"].n_components.mean()),
-            })  # fmt: skip
+            mixed.append(
+                {
+                    "mixture": r,
+                    "sampler": name,
+                    "seconds": spent,
+                    "R-hat": max(float(az.rhat(x)) for x in varying),
+                    "ESS": min(float(az.ess(x, method="mean")) for x in varying),
+                    "components": float(data[-1]["assignments"].n_components.mean()),
+                }
+            )
         compared += compare(r, *data)
     return compared, mixed
 
 
 def invariant_statistics(drawn: Drawn, feature_names: tuple[str, ...]) -> dict[str, np.ndarray]:
-    """What is ranked, ``[...]``: nothing that depends on what the ways are called."""
+    """Compute the ranked statistics, ``[...]``; they are invariant to the order of the components."""
     counts = (drawn.assignment[..., None] == np.arange(drawn.proportions.shape[-1])).sum(-2)
     first = np.take_along_axis(drawn.weights, drawn.assignment[..., :1, None], axis=-2)[..., 0, :]
     ranked = {
@@ -243,9 +249,14 @@ def rank_statistics(
     def true_and_drawn(r: int) -> tuple[dict, dict, int]:
         demonstration = Demonstration.from_codes(np.asarray(drawn.codes[r]))
         problem, *_ = pose(
-            setting.mdp, setting.sensor, demonstration, concentration=setting.concentration,
-            prior=setting.prior, at_least_one={}, warmup=0,
-        )  # fmt: skip
+            setting.mdp,
+            setting.sensor,
+            demonstration,
+            concentration=setting.concentration,
+            prior=setting.prior,
+            at_least_one={},
+            warmup=0,
+        )
         sites = [x[r : r + 1] for x in drawn[:3]]
         known = resolve_jit(resolve_keys[r : r + 1], *sites, problem, drawn.assignment[r : r + 1])
         totals = (known.assignment, known.log_likelihood.sum(-1), known.log_joint)
@@ -284,7 +295,7 @@ def rank_statistics(
 
 
 def tails(compared: list[Comparison]) -> dict[str, Any]:
-    """The largest ``|z|`` and how many exceed 2 and 3, with what agreement would lead one to expect.
+    """Count ``|z|`` above 2 and 3, with their expectations under agreement, and find the largest.
 
     Moments of one posterior are correlated, so that counts vary more than those of independent ones; the
     chance of so large a ``|z|`` among as many independent ones is then an upper bound.
@@ -316,8 +327,10 @@ def main() -> None:
 
     setting = small_mixture(trajectories=6, length=8, components=10)
     shared = {
-        "components": setting.components, "concentration": setting.concentration, "prior": setting.prior
-    }  # fmt: skip
+        "components": setting.components,
+        "concentration": setting.concentration,
+        "prior": setting.prior,
+    }
     if options.mixtures:
         began = time.perf_counter()
         compared, mixed = agreement(
@@ -329,23 +342,27 @@ def main() -> None:
         )
         spread = tails(compared)
         results["agreement"] = {
-            **spread, "seconds": time.perf_counter() - began, "mixing": mixed,
+            **spread,
+            "seconds": time.perf_counter() - began,
+            "mixing": mixed,
             "compared": [c._asdict() for c in compared],
-        }  # fmt: skip
+        }
         print_table("Chains", tuple(mixed[0]), [tuple(m.values()) for m in mixed])
         print_table(
             f"NUTS and Gibbs: {len(compared)} moments of {options.mixtures} posteriors, furthest apart",
             Comparison._fields,
             sorted(compared, key=lambda c: -abs(c.z))[:6],
         )
-        print_table("Differences in standard errors", ("", "value"), [
-            (name, value) for name, value in spread.items() if name != "largest z"
-        ])  # fmt: skip
+        print_table(
+            "Differences in standard errors",
+            ("", "value"),
+            [(name, value) for name, value in spread.items() if name != "largest z"],
+        )
         publish("mixture", results)
 
     setting = small_mixture(trajectories=5, length=6, components=5)
     shared["components"] = setting.components
-    # Chains long enough that draws kept are close to independent.
+    # Chains long enough that thinned draws are close to independent.
     calibrated: dict[str, tuple[Array, Sampler, int]] = {
         "Gibbs": (
             gibbs_key,
@@ -365,12 +382,14 @@ def main() -> None:
         tests = uniformity(ranks)
         least = min(test.p_value for test in tests)
         results["calibration"][name] = {
-            "draws": ranks.draws, "divergences": ranks.divergences,
+            "draws": ranks.draws,
+            "divergences": ranks.divergences,
             "quantities": [test._asdict() for test in tests],
-            "smallest p": least, "chance of one as small": 1 - (1 - least) ** len(tests),
+            "smallest p": least,
+            "chance of one as small": 1 - (1 - least) ** len(tests),
             "seconds": time.perf_counter() - began,
             "ranks": {q: column.tolist() for q, column in zip(ranks.names, ranks.ranks.T, strict=True)},
-        }  # fmt: skip
+        }
         print_table(
             f"{name}: ranks of the truth, {options.replications} replications "
             f"({results['calibration'][name]['seconds']:.0f} s)",

@@ -1,14 +1,15 @@
-"""How often intervals of the joint posterior over weights and reliabilities cover the truth.
+"""Coverage of intervals of the joint posterior over weights and reliabilities.
 
 ``python -m i2rl.analysis.benchmarks.statistics.noisy_coverage`` draws weights and reliabilities from the
-model's own prior, lets a soft expert of those weights be reported through :class:`FeatureNoise` of those
+model's own prior, observes a soft expert of those weights through :class:`FeatureNoise` of those
 reliabilities, and samples the joint posterior by NUTS. Intervals of probability 0.9 then cover the truth in
-90 % of the runs, and the truth's rank among the draws is uniform (Cook, Gelman and Rubin 2006; Talts et al.
-2018), if model, simulation and sampler agree. That holds on average over the prior, whether or not the data
-tell sloppy experts from sloppy sensors: it says nothing of what is identified, nor of any one truth.
+90 % of the replications, and the truth's rank among the draws is uniform (Cook, Gelman and Rubin 2006; Talts
+et al. 2018), if model, simulation and sampler agree. That holds on average over the prior, also if the data
+do not separate sloppy experts from sloppy sensors: it is no statement about identification or about a single
+truth.
 
 Reliabilities come from the model's default, Beta(4, 1), perception being more often right than wrong. With
-``--uniform`` ones a predicate reported wrongly, and weights of the other sign, explain almost as well: a
+``--uniform`` ones a predicate observed wrongly, and weights of the other sign, explain almost as well: a
 second mode, which chains seldom reach from the first.
 """
 
@@ -48,7 +49,7 @@ MIXED = 1.05
 
 
 class NoisySetting(NamedTuple):
-    """What is replicated: a task, its predicates and priors, ``trajectories`` of ``length`` steps."""
+    """Replicated setting: a task, its predicates and priors, ``trajectories`` of ``length`` steps."""
 
     name: str
     mdp: TabularMDP
@@ -67,7 +68,7 @@ class NoisySetting(NamedTuple):
 
 
 class Sampling(NamedTuple):
-    """How every posterior is sampled; ``draws`` are kept of each of ``chains``."""
+    """Settings of every posterior's sampler; it retains ``draws`` of each of ``chains``."""
 
     chains: int = 2
     warmup: int = 300
@@ -95,17 +96,17 @@ class Run(NamedTuple):
 
 
 class CoverageStudy(NamedTuple):
-    """All replications.
+    """Results of all replications.
 
     Fields
     ------
     quantities : tuple of str ``[Q]``
     covered : bool ``[R, Q]``
-        By the central interval of probability 0.9.
+        Coverage by the central interval of probability 0.9.
     jointly_covered : bool ``[R]``
-        By the region of highest joint density of that probability.
+        Coverage by the region of highest joint density of that probability.
     ranks : int ``[R, Q]``
-        Of the truth among ``kept`` draws, equally far apart.
+        Rank of the truth among ``kept`` draws, equally far apart.
     kept : int
     r_hat, ess : float ``[R, Q]``
         Rank-normalised R-hat and bulk effective sample size.
@@ -150,16 +151,22 @@ def corridor(reliability_prior: dist.Distribution | None = None) -> NoisySetting
         transitions, features, discount=0.9, feature_names=("moving", "the far end", "waiting")
     )
     return NoisySetting(
-        "corridor", mdp, predicates, ("going on", "turning", "the near half"),
-        dist.Normal(0.0, 1.5), reliability_prior, 10, 5,
-    )  # fmt: skip
+        "corridor",
+        mdp,
+        predicates,
+        ("going on", "turning", "the near half"),
+        dist.Normal(0.0, 1.5),
+        reliability_prior,
+        10,
+        5,
+    )
 
 
 def sorting(reliability_prior: dist.Distribution | None = None) -> NoisySetting:
-    """Noisy sorting, six sessions of two trajectories of three steps that start anywhere.
+    """Make noisy sorting, six sessions of two trajectories of three steps that start anywhere.
 
-    Two pairs of its eight predicates are one function, and some features never occur: nothing but priors
-    tells their parameters apart.
+    Two pairs of its eight predicates are one function, and some features never occur: only priors determine
+    their parameters.
     """
     task = noisy_sorting()
     return NoisySetting(
@@ -171,19 +178,19 @@ def sorting(reliability_prior: dist.Distribution | None = None) -> NoisySetting:
 
 
 def replicate(
-    key: Array, setting: NoisySetting, runs: int, sampling: Sampling | None = None
+    key: Array, setting: NoisySetting, replications: int, sampling: Sampling | None = None
 ) -> Iterator[Run]:
-    """Draw truths from the prior, simulate, and sample each posterior; the same key gives the same runs.
+    """Draw truths from the prior, simulate, and sample each posterior; a key determines the replications.
 
-    Chains start as those of ``sample_noisy_posterior``. All runs share one compiled sampler and keep every
-    processor busy. Raises ``ValueError`` for fewer than one run.
+    Chains start as those of ``sample_noisy_posterior``. All replications share one compiled sampler and keep
+    every processor busy. Raises ``ValueError`` for fewer than one run.
     """
-    if runs < 1:
-        raise ValueError(f"runs must be at least 1, got {runs}")
+    if replications < 1:
+        raise ValueError(f"replications must be at least 1, got {replications}")
     sampling = Sampling() if sampling is None else sampling
     template = _template(setting)
     one = partial(_replication, template=template, setting=setting, sampling=sampling)
-    first, *others = jax.random.split(key, runs)
+    first, *others = jax.random.split(key, replications)
     # Alone, so that threads do not compile the same programs side by side.
     yield one(first)
     with ThreadPoolExecutor(os.cpu_count() or 1) as pool:
@@ -191,13 +198,16 @@ def replicate(
 
 
 def _template(setting: NoisySetting) -> NoisyProblem:
-    """A problem of the setting's priors with room for its trajectories, each a row: all runs share it."""
-    # Any report is possible of any truth, so one will do for the checks.
+    """Compile the problem that all replications share: the setting's priors, a row for each trajectory."""
+    # Every observation is possible for every truth, so one suffices for the checks.
     report = Demonstration.from_pairs(np.zeros((1, 1), int), np.zeros((1, 1), int))
     problem, _ = noisy_problem(
-        setting.mdp, setting.predicates, report,
-        prior=setting.prior, reliability_prior=setting.reliability_prior,
-    )  # fmt: skip
+        setting.mdp,
+        setting.predicates,
+        report,
+        prior=setting.prior,
+        reliability_prior=setting.reliability_prior,
+    )
     n, length = setting.trajectories, setting.length
     return problem._replace(codes=jnp.zeros((n, length, 3), jnp.int32), repeats=jnp.ones(n, int))
 
@@ -265,7 +275,7 @@ def _densities(
 def covers(
     draws: Float[np.ndarray, "D Q"], truth: Float[np.ndarray, " Q"], probability: float = PROBABILITY
 ) -> Bool[np.ndarray, " Q"]:
-    """Whether each truth lies in the central interval of its draws.
+    """Test whether each truth lies in the central interval of its draws.
 
     Raises ``ValueError`` for a probability outside (0, 1).
     """
@@ -279,7 +289,7 @@ def covers(
 def rank_among(
     draws: Float[np.ndarray, "D Q"], truth: Float[np.ndarray, " Q"], kept: int
 ) -> Int[np.ndarray, " Q"]:
-    """Rank of each truth, from 0 to ``kept``, among as many draws equally far apart.
+    """Rank each truth, from 0 to ``kept``, among as many draws equally far apart.
 
     Raises ``ValueError`` for more draws than there are.
     """
@@ -290,20 +300,25 @@ def rank_among(
     return ranks
 
 
-def judge(quantities: tuple[str, ...], runs: Iterable[Run], kept: int = 31) -> CoverageStudy:
-    """Coverage, ranks and diagnostics of every run; raises ``ValueError`` for no runs and as its parts do."""
+def judge(quantities: tuple[str, ...], replications: Iterable[Run], kept: int = 31) -> CoverageStudy:
+    """Judge the coverage, ranks and diagnostics of every replication.
+
+    Raises ``ValueError`` without replications, and as its parts do.
+    """
     rows = []
-    for run in runs:
+    for run in replications:
         draws = run.draws.reshape(-1, run.draws.shape[-1])
         data = xr.DataArray(run.draws, dims=("chain", "draw", "quantity")).to_dataset(name="x")
-        rows.append((
-            covers(draws, run.truth),
-            run.true_log_density >= np.quantile(run.log_density, 1 - PROBABILITY),
-            rank_among(draws, run.truth, kept),
-            az.rhat(data).x.values,
-            az.ess(data).x.values,
-            run.divergences,
-        ))  # fmt: skip
+        rows.append(
+            (
+                covers(draws, run.truth),
+                run.true_log_density >= np.quantile(run.log_density, 1 - PROBABILITY),
+                rank_among(draws, run.truth, kept),
+                az.rhat(data).x.values,
+                az.ess(data).x.values,
+                run.divergences,
+            )
+        )
     if not rows:
         raise ValueError("coverage is judged over at least one run")
     covered, jointly, ranks, r_hat, ess, divergences = (np.array(x) for x in zip(*rows, strict=True))
@@ -311,19 +326,19 @@ def judge(quantities: tuple[str, ...], runs: Iterable[Run], kept: int = 31) -> C
 
 
 def coverage_interval(covered: Bool[np.ndarray, " R"]) -> tuple[float, float]:
-    """Clopper and Pearson's 95 % interval for the probability behind a share of runs."""
+    """Clopper and Pearson's 95 % interval for the probability behind a share of replications."""
     interval = stats.binomtest(int(covered.sum()), len(covered)).proportion_ci(0.95, "exact")
     return float(interval.low), float(interval.high)
 
 
 def report(study: CoverageStudy, bins: int = 16) -> dict[str, Any]:
-    """What the study found, as numbers that go to JSON.
+    """Return the study's results as numbers for JSON.
 
-    ``overall``: the share of all intervals, over runs and quantities, that cover; its error is that of a mean
-    over runs, as quantities of one run go together. ``ranks p``: chi-square test over ``bins``. Chains of a
-    run have ``mixed`` if every R-hat is below ``MIXED``.
+    ``overall``: the share of all intervals, over replications and quantities, that cover; its error is that
+    of a mean over replications, as quantities of one run go together. ``ranks p``: chi-square test over
+    ``bins``. Chains of a run have ``mixed`` if every R-hat is below ``MIXED``.
     """
-    runs = len(study.covered)
+    replications = len(study.covered)
     tests = uniformity(Ranks(study.quantities, study.ranks, study.kept, int(study.divergences.sum())), bins)
     columns = [*zip(study.quantities, study.covered.T, strict=True), ("all jointly", study.jointly_covered)]
     ps = [*(test.p_value for test in tests), None]
@@ -335,10 +350,10 @@ def report(study: CoverageStudy, bins: int = 16) -> dict[str, Any]:
         )
     per_run, mixed = study.covered.mean(1), (study.r_hat < MIXED).all(1)
     return {
-        "runs": runs,
+        "replications": replications,
         "quantities": quantities,
         "overall": float(per_run.mean()),
-        "overall_error": float(per_run.std(ddof=1) / np.sqrt(runs)) if runs > 1 else None,
+        "overall_error": float(per_run.std(ddof=1) / np.sqrt(replications)) if replications > 1 else None,
         "smallest_p": min(test.p_value for test in tests),
         "largest_r_hat": float(study.r_hat.max()),
         "runs_mixed": int(mixed.sum()),
@@ -356,7 +371,7 @@ SETTINGS = {"corridor": corridor, "sorting": sorting}
 def main() -> None:
     """Run and publish."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=400)
+    parser.add_argument("--replications", type=int, default=400)
     parser.add_argument("--task", choices=tuple(SETTINGS), default="corridor")
     parser.add_argument(
         "--uniform", action="store_true", help="reliabilities from Beta(1, 1), not the model's default"
@@ -368,13 +383,15 @@ def main() -> None:
     setting = SETTINGS[options.task](dist.Beta(1.0, 1.0) if options.uniform else None)
     sampling = Sampling(warmup=options.warmup, draws=options.draws)
     began = time.perf_counter()
-    runs = replicate(jax.random.key(options.seed), setting, options.runs, sampling)
-    study = judge(setting.quantities, track(runs, total=options.runs, console=Console(stderr=True)))
-    found = {
-        "task": setting.name, **vars(options), **report(study), "seconds": time.perf_counter() - began
-    }  # fmt: skip
+    replications = replicate(jax.random.key(options.seed), setting, options.replications, sampling)
+    study = judge(
+        setting.quantities, track(replications, total=options.replications, console=Console(stderr=True))
+    )
+    found = {"task": setting.name, **vars(options), **report(study), "seconds": time.perf_counter() - began}
     print_table(
-        f"Share of {options.runs} runs whose {PROBABILITY:.0%} intervals cover the truth: {setting.name}",
+        f"Share of {options.replications} replications whose {PROBABILITY:.0%} intervals "
+        "cover the truth: "
+        f"{setting.name}",
         tuple(found["quantities"][0]),
         [["-" if x is None else x for x in q.values()] for q in found["quantities"]],
     )

@@ -1,8 +1,8 @@
-"""RIMEO's bounds under noisy perception: how often they hold, how loose they are, and what they ask for.
+"""RIMEO's bounds under noisy perception: coverage, looseness and data required.
 
-``python -m i2rl.analysis.benchmarks.statistics.perception`` repeats simulated runs on two small tasks whose
-predicates can be reported independently, and on the proof's step alone also on onion sorting, where they
-cannot. Hidden pairs are filled in under the expert's weights, then under the learner's own, at several
+``python -m i2rl.analysis.benchmarks.statistics.perception`` simulates replications on two small tasks whose
+predicates are observed independently, and of the proof's step alone also on onion sorting, where they are
+dependent. Hidden pairs are filled in under the expert's weights, then under the learner's own, at several
 reliabilities.
 """
 
@@ -89,26 +89,30 @@ def rare_setting() -> Setting:
 def main() -> None:
     """Run and publish."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--runs", type=int, default=300)
-    parser.add_argument("--learned-runs", type=int, default=20)
+    parser.add_argument("--replications", type=int, default=300)
+    parser.add_argument("--learned-replications", type=int, default=20)
     parser.add_argument("--seed", type=int, default=0)
     options = parser.parse_args()
-    key, runs, learned = jax.random.key(options.seed), options.runs, options.learned_runs
+    key, replications, learned = (
+        jax.random.key(options.seed),
+        options.replications,
+        options.learned_replications,
+    )
     studies: list[tuple[Callable[..., list[Coverage]], Setting, tuple]] = [
-        (perception_coverage, shift_setting(0.7, 3), (runs, 3000, 4, 10**7, _DELTA)),
-        (perception_coverage, random_reported_setting(0.8, 5), (runs, 60, 8, 20_000, _DELTA)),
-        (posterior_change, shift_setting(0.7, 3), (0.01, runs, 60)),
-        (posterior_change, random_reported_setting(0.8, 5), (0.01, runs, 60)),
-        (posterior_change, rare_setting(), (0.005, runs, 60)),
+        (perception_coverage, shift_setting(0.7, 3), (replications, 3000, 4, 10**7, _DELTA)),
+        (perception_coverage, random_reported_setting(0.8, 5), (replications, 60, 8, 20_000, _DELTA)),
+        (posterior_change, shift_setting(0.7, 3), (0.01, replications, 60)),
+        (posterior_change, random_reported_setting(0.8, 5), (0.01, replications, 60)),
+        (posterior_change, rare_setting(), (0.005, replications, 60)),
         (posterior_change, sorting_setting(), (0.005, 30, 60)),
     ]
-    for reliability, length, size, reports in (
+    for reliability, length, size, observations in (
         (0.7, 3, 3000, 10**7),
         *((p, _WHOLE, 2000, 10**9) for p in (0.5, 0.6, 0.7, 0.9)),
     ):
         setting = shift_setting(reliability, length)
         for shift in (-1.0, 1.0):
-            arguments = (learned, size, 4, reports, _DELTA, shift)
+            arguments = (learned, size, 4, observations, _DELTA, shift)
             studies.append((learned_perception_coverage, setting, arguments))
     rows: list[Coverage] = []
     ignorance = {}
@@ -119,13 +123,21 @@ def main() -> None:
         print(f"{study.__name__} on {setting.name}: {time.perf_counter() - began:.0f} s", flush=True)
     print_table(
         "Coverage",
-        ["bound", "n", "runs", "stated", "covered", "bound", "quantile", "looseness"],
+        ["bound", "n", "replications", "stated", "covered", "bound", "quantile", "looseness"],
         [
-            (f"{r.setting}: {r.result}", r.trajectories, r.runs, r.confidence, r.covered, r.bound, r.quantile,
-             r.looseness)
+            (
+                f"{r.setting}: {r.result}",
+                r.trajectories,
+                r.replications,
+                r.confidence,
+                r.covered,
+                r.bound,
+                r.quantile,
+                r.looseness,
+            )
             for r in rows
         ],
-    )  # fmt: skip
+    )
     print("Gap of knowing nothing (zero weights), nats:", ignorance)
     # Sorting as section 7.4.3 has it, and as the theorem asks: as long as discounting with 0.99 leaves 0.015.
     needed = {steps: perception_needed(11, 8, steps, 0.15, 0.8) for steps in (3, 418)}

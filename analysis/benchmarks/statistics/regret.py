@@ -11,8 +11,7 @@ true weights, which lie in [0, 1]^K:
     The same with 5 steps a trajectory: 95 % of the features are the learner's own guess.
 ``everyday``
     30 % in view, 5 steps a trajectory, the default statistic. Trajectories are independent here too: this
-    expert strolls, and half of its long walks stay out of view for hundreds of steps, where there is
-    nothing to learn from.
+    expert strolls, and half of its long walks stay out of view for hundreds of steps, without evidence.
 ``greedy``
     The same view of patrollers who never err, and who meet; consecutive fragments of one walk. No weights
     have their policy as a soft policy, so the risk is never 0.
@@ -72,7 +71,7 @@ class Threshold(NamedTuple):
 
 
 class Setting(NamedTuple):
-    """What is watched, who learns from it, and with which thresholds."""
+    """Observed task, its learner, and its thresholds."""
 
     title: str
     demonstrations: Demonstration
@@ -107,8 +106,10 @@ def _thresholds(constant: float, beta: float, scales: tuple[float, ...], session
     return rows + [Threshold(f"c / i, c = {c:g}", Harmonic(c), c / i) for c in scales]
 
 
-def settings(patrol: Patrol, key: Array, runs: int, sessions: int) -> dict[str, Callable[[], Setting]]:
-    """The four settings by name; each is simulated when called."""
+def settings(
+    patrol: Patrol, key: Array, replications: int, sessions: int
+) -> dict[str, Callable[[], Setting]]:
+    """Return the four settings by name; each is simulated when called."""
     mdp, view = patrol.mdp, patrol.visibility(PERCENT)
     plan = soft_plan(mdp, reward_of(mdp, jnp.asarray(patrol.weights)))
     expert = jnp.asarray(patrol.expert_policy())
@@ -118,31 +119,43 @@ def settings(patrol: Patrol, key: Array, runs: int, sessions: int) -> dict[str, 
     seen = _thresholds(DEFAULT_SLACK, DEFAULT_SLACK, (0.01, 0.1, 1.0), sessions)
 
     def whole(steps: int) -> Setting:
-        codes = _walks(key, patrol, plan.log_policy, Sensor(), (runs * sessions, steps))
+        codes = _walks(key, patrol, plan.log_policy, Sensor(), (replications * sessions, steps))
         return Setting(
-            f"full view, {steps} steps, features statistic", streams(codes.reshape(runs, sessions, 1, -1, 3)),
-            plan.policy, occupancy(mdp, plan.policy),
+            f"full view, {steps} steps, features statistic",
+            streams(codes.reshape(replications, sessions, 1, -1, 3)),
+            plan.policy,
+            occupancy(mdp, plan.policy),
             lambda slack: me_i2rl(mdp, statistic="features", slack=slack),
-            tuple(features), steps == LONG,
-        )  # fmt: skip
+            tuple(features),
+            steps == LONG,
+        )
 
     def everyday() -> Setting:
-        codes = _walks(key, patrol, plan.log_policy, view, (runs * sessions, SHORT))
+        codes = _walks(key, patrol, plan.log_policy, view, (replications * sessions, SHORT))
         return Setting(
             f"{PERCENT} % in view, {SHORT} steps, default statistic",
-            streams(codes.reshape(runs, sessions, 1, SHORT, 3)), plan.policy,
+            streams(codes.reshape(replications, sessions, 1, SHORT, 3)),
+            plan.policy,
             in_view * expected_visits(mdp, plan.policy, SHORT),
-            lambda slack: lme_i2rl(mdp, view, slack=slack), tuple(seen), False,
-        )  # fmt: skip
+            lambda slack: lme_i2rl(mdp, view, slack=slack),
+            tuple(seen),
+            False,
+        )
 
     def greedy() -> Setting:
-        rows = [demonstrate(k, patrol, PERCENT, sessions, SHORT)[0] for k in jax.random.split(key, runs)]
+        rows = [
+            demonstrate(k, patrol, PERCENT, sessions, SHORT)[0] for k in jax.random.split(key, replications)
+        ]
         codes = np.stack([row.codes for row in rows])[:, :, None]
         return Setting(
             f"{PERCENT} % in view, patrollers who never err, default statistic",
-            streams(codes), expert, in_view * expected_visits(mdp, expert, SHORT, sessions),
-            lambda slack: lme_i2rl(mdp, view, slack=slack), tuple(seen), False,
-        )  # fmt: skip
+            streams(codes),
+            expert,
+            in_view * expected_visits(mdp, expert, SHORT, sessions),
+            lambda slack: lme_i2rl(mdp, view, slack=slack),
+            tuple(seen),
+            False,
+        )
 
     return {
         "theorem": lambda: whole(LONG),
@@ -153,14 +166,18 @@ def settings(patrol: Patrol, key: Array, runs: int, sessions: int) -> dict[str, 
 
 
 def measure(patrol: Patrol, setting: Setting, key: Array) -> dict[str, Gaps]:
-    """Every threshold on the same streams."""
+    """Measure every threshold on the same streams."""
     return {
         t.name: regret_gaps(
-            setting.learner(t.slack), key, setting.demonstrations, jnp.asarray(patrol.weights),
-            setting.policy, setting.visits,
+            setting.learner(t.slack),
+            key,
+            setting.demonstrations,
+            jnp.asarray(patrol.weights),
+            setting.policy,
+            setting.visits,
         )
         for t in setting.thresholds
-    }  # fmt: skip
+    }
 
 
 def _row(gaps: Gaps, burn_in: int) -> dict[str, Any]:
@@ -170,7 +187,7 @@ def _row(gaps: Gaps, burn_in: int) -> dict[str, Any]:
     mean = regret.mean(0)
     return {
         "slope of the mean": log_log_slope(mean, burn_in).slope,
-        "slopes of the runs": [min(each), float(np.median(each)), max(each)],
+        "slopes of the replications": [min(each), float(np.median(each)), max(each)],
         "slope of the last three quarters": log_log_slope(mean, sessions // 4).slope,
         "average regret": {str(t): float(mean[t - 1]) for t in marks},
         "last excess risk": float(gaps.expected[:, -1].mean()),
@@ -193,15 +210,20 @@ def _draw(path: Path, setting: Setting, measured: dict[str, Gaps], patrol: Patro
         sure = {main.name: sure_bound(main.beta, patrol.weights)}
     save_themes(
         lambda theme: regret_plot(
-            curves, theorem=theorem, sure=sure, burn_in=burn_in, theme=theme,
+            curves,
+            theorem=theorem,
+            sure=sure,
+            burn_in=burn_in,
+            theme=theme,
             title=f"Average regret: {setting.title}",
         ),
-        path.parent, path.name,
-    )  # fmt: skip
+        path.parent,
+        path.name,
+    )
 
 
 def main(
-    runs: Annotated[int, typer.Option(help="Streams per threshold.")] = 4,
+    replications: Annotated[int, typer.Option(help="Streams per threshold.")] = 4,
     sessions: Annotated[int, typer.Option(help="Sessions per stream.")] = 500,
     burn_in: Annotated[int, typer.Option(help="First session of the slope.")] = 10,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
@@ -213,12 +235,15 @@ def main(
     key = jax.random.key(seed)
     k, discount = patrol.mdp.n_features, float(patrol.mdp.discount)
     results: dict[str, Any] = {
-        "runs": runs, "sessions": sessions, "burn in": burn_in, "seed": seed,
+        "replications": replications,
+        "sessions": sessions,
+        "burn in": burn_in,
+        "seed": seed,
         "last session with a positive confidence of Theorem 5, one trajectory a session": {
             f"c = {c:g}": last_confident_session(c, 1, k, discount) for c in (0.1, 1.0, 10.0, 100.0)
         },
-    }  # fmt: skip
-    for name, simulated in settings(patrol, key, runs, sessions).items():
+    }
+    for name, simulated in settings(patrol, key, replications, sessions).items():
         if only not in ("", name):
             continue
         began, setting = time.perf_counter(), simulated()
@@ -231,19 +256,29 @@ def main(
         results[name] = {"setting": setting.title, "seconds": time.perf_counter() - began, "rows": rows}
         _draw(path.parent / f"regret-{name}", setting, measured, patrol, burn_in)
         print_table(
-            f"{name}: {setting.title}; {runs} streams of {sessions} sessions",
-            ("threshold", "slope", "slopes of runs", "late slope", "regret", "last risk", "empirical"),
+            f"{name}: {setting.title}; {replications} streams of {sessions} sessions",
+            (
+                "threshold",
+                "slope",
+                "slopes of replications",
+                "late slope",
+                "regret",
+                "last risk",
+                "empirical",
+            ),
             [
                 (
-                    threshold, row["slope of the mean"],
-                    " ".join(f"{x:.2f}" for x in row["slopes of the runs"]),
+                    threshold,
+                    row["slope of the mean"],
+                    " ".join(f"{x:.2f}" for x in row["slopes of the replications"]),
                     row["slope of the last three quarters"],
                     " ".join(f"{x:.3g}" for x in row["average regret"].values()),
-                    row["last excess risk"], row["empirical average regret"],
+                    row["last excess risk"],
+                    row["empirical average regret"],
                 )
                 for threshold, row in rows.items()
             ],
-        )  # fmt: skip
+        )
         publish(path.stem, results, path)
 
 

@@ -1,4 +1,4 @@
-"""Does leave-one-out cross-validation pick the features that the expert cares about?
+"""Selection of the expert's features by leave-one-out cross-validation.
 
 ``python -m i2rl.analysis.benchmarks.statistics.selection`` compares four feature sets on patrol 2, from
 fragments of five steps at 30 % observability, for two experts: the domain's patrollers, who never err, and
@@ -41,7 +41,7 @@ EXPERTS = ("greedy", "soft")
 
 
 def feature_sets(patrol: Patrol) -> dict[str, TabularMDP]:
-    """The four sets."""
+    """Return the four sets."""
     mdp, names = patrol.mdp, patrol.mdp.feature_names
     turning = np.zeros((mdp.n_states, mdp.n_actions, 1))
     turning[:, [LEFT, RIGHT]] = 1
@@ -57,7 +57,7 @@ def feature_sets(patrol: Patrol) -> dict[str, TabularMDP]:
 
 
 def shown(expert: str, seed: int, patrol: Patrol, fragments: int) -> Demonstration:
-    """What is seen of one of the two experts."""
+    """Simulate the observation of one of the two experts."""
     key = jax.random.key(seed)
     if expert == "greedy":
         return demonstrate(key, patrol, OBSERVABILITY, fragments)[0]
@@ -90,7 +90,7 @@ def judge(posteriors: Mapping[str, az.InferenceData]) -> dict[str, Any]:
 def main() -> None:
     """Run and publish."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=20)
+    parser.add_argument("--replications", type=int, default=20)
     parser.add_argument("--fragments", type=int, default=60)
     parser.add_argument("--draws", type=int, default=100, help="of each of two chains")
     parser.add_argument("--warmup", type=int, default=75)
@@ -98,15 +98,20 @@ def main() -> None:
     patrol = instance(2)
     sets, runs = feature_sets(patrol), []
     for expert in EXPERTS:
-        for seed in range(options.seeds):
+        for seed in range(options.replications):
             began = time.perf_counter()
             with warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # of Pareto shapes, which are reported
+                warnings.simplefilter("ignore")  # of Pareto shapes, which are printed
                 compared = compare_features(
-                    jax.random.fold_in(jax.random.key(seed), EXPERTS.index(expert)), sets,
-                    patrol.visibility(OBSERVABILITY), shown(expert, seed, patrol, options.fragments),
-                    draws=options.draws, warmup=options.warmup, chains=2, target_accept=0.8,
-                )  # fmt: skip
+                    jax.random.fold_in(jax.random.key(seed), EXPERTS.index(expert)),
+                    sets,
+                    patrol.visibility(OBSERVABILITY),
+                    shown(expert, seed, patrol, options.fragments),
+                    draws=options.draws,
+                    warmup=options.warmup,
+                    chains=2,
+                    target_accept=0.8,
+                )
                 record = {"expert": expert, "seed": seed, **judge(compared.posteriors)}
             record["seconds"] = time.perf_counter() - began
             runs.append(record)
@@ -119,22 +124,36 @@ def main() -> None:
     for expert in EXPERTS:
         own = [run for run in runs if run["expert"] == expert]
         harder = [run["without division 2"] for run in own]
-        rows.append((
-            expert,
-            f"{sum(run['picked'] == 'six' for run in own)} of {len(own)}",
-            float(min(min(run[name]["advantage"] for name in RIVALS[1:]) for run in own)),
-            f"{sum(pair['advantage'] > 0 for pair in harder)} of {len(own)}",
-            float(np.median([pair["advantage"] for pair in harder])),
-            max(run["largest_k"] for run in own), max(run["share_above"] for run in own),
-            max(run["R-hat"] for run in own), sum(run["divergences"] for run in own),
-            float(np.median([run["seconds"] for run in own])),
-        ))  # fmt: skip
+        rows.append(
+            (
+                expert,
+                f"{sum(run['picked'] == 'six' for run in own)} of {len(own)}",
+                float(min(min(run[name]["advantage"] for name in RIVALS[1:]) for run in own)),
+                f"{sum(pair['advantage'] > 0 for pair in harder)} of {len(own)}",
+                float(np.median([pair["advantage"] for pair in harder])),
+                max(run["largest_k"] for run in own),
+                max(run["share_above"] for run in own),
+                max(run["R-hat"] for run in own),
+                sum(run["divergences"] for run in own),
+                float(np.median([run["seconds"] for run in own])),
+            )
+        )
     print_table(
         f"Patrol 2, {options.fragments} fragments at {OBSERVABILITY} %: is the true set of features picked?",
-        ("expert", "picked", "least advantage", "against five", "median advantage", "largest k",
-         "share above 0.7", "R-hat", "divergences", "seconds"),
+        (
+            "expert",
+            "picked",
+            "least advantage",
+            "against five",
+            "median advantage",
+            "largest k",
+            "share above 0.7",
+            "R-hat",
+            "divergences",
+            "seconds",
+        ),
         rows,
-    )  # fmt: skip
+    )
 
 
 if __name__ == "__main__":

@@ -1,17 +1,17 @@
 """Stopping rules on 200 streams of the second patrol instance: false stops, and sessions saved.
 
 30 % in view, consecutive fragments of five steps, a session each; the first patroller of each run, so that
-streams are independent. All rules see the same reports. A false stop is defined in
+streams are independent. All rules see the same infos. A false stop is defined in
 :mod:`i2rl.analysis.bounds.stopping`: stopped although the learned behaviour was still worse, by more than 5
-points of LBA, than what the stream settles at, the mean of its last 24 sessions. Other margins (2 and 10
-points) are measured to see whether the verdict hinges on it.
+points of LBA, than the mean of the stream's last 24 sessions. Other margins (2 and 10 points) are measured to
+see whether the verdict hinges on it.
 
 Two controls. A window of ``w`` sessions cannot fire before session ``w``: ``fixed number`` stops every stream
-after ``n`` sessions without looking. And the single-step rules are the windows' own, of width two in effect.
+after ``n`` sessions without data. And the single-step rules are the windows' own, of width two in effect.
 
-The width of a window is what decides. For up to 10 sessions on end nothing is in view (the loop has 56
-steps), the learner's quantities stand still for want of data, and a rule that looks at fewer sessions takes
-that for convergence.
+The width of a window determines the result. For up to 10 sessions in a row no step is in view (the loop has
+56 steps), the learner's quantities stand still for want of data, and a rule over fewer sessions takes that
+for convergence.
 
 Run as ``python -m i2rl.analysis.benchmarks.statistics.stopping``; ``--reuse`` judges the streams of the last
 run again.
@@ -57,10 +57,10 @@ WIDTHS = (5, 8, 10, 12, 14, 20, 40)
 SHARES = np.array([0.0, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5])
 
 
-def learn(patrol: Patrol, runs: int, sessions: int, seed: int) -> dict[str, np.ndarray]:
-    """Reports of all streams: log-likelihoods and gradients ``[R, T]``, weights ``[R, T, K]``."""
+def learn(patrol: Patrol, replications: int, sessions: int, seed: int) -> dict[str, np.ndarray]:
+    """Learn all streams: log-likelihoods and gradients ``[R, T]``, weights ``[R, T, K]``."""
     key, start = jax.random.key(seed), jax.random.key(seed + 1)
-    rows = [demonstrate(k, patrol, PERCENT, sessions, STEPS)[0] for k in jax.random.split(key, runs)]
+    rows = [demonstrate(k, patrol, PERCENT, sessions, STEPS)[0] for k in jax.random.split(key, replications)]
     streams = jax.tree.map(lambda *parts: np.stack(parts)[:, :, None], *rows)
     learner = lme_i2rl(patrol.mdp, patrol.visibility(PERCENT))
     _, reports = run_streams(learner, start, streams)
@@ -69,7 +69,7 @@ def learn(patrol: Patrol, runs: int, sessions: int, seed: int) -> dict[str, np.n
 
 
 def histories(patrol: Patrol, reports: dict[str, np.ndarray]) -> Histories:
-    """The reports, with the behaviour learned by each session and how good it is."""
+    """Return the infos of all sessions, with each session's learned behaviour and its accuracy."""
     mdp, true = patrol.mdp, jnp.asarray(patrol.weights)
     weights = reports["weights"]
     shape = weights.shape[:2]
@@ -82,62 +82,95 @@ def histories(patrol: Patrol, reports: dict[str, np.ndarray]) -> Histories:
     mapped = jax.jit(lambda w: jax.lax.map(one, w))(jnp.asarray(weights).reshape(-1, weights.shape[-1]))
     greedy, error, accuracy = (np.asarray(x) for x in mapped)
     return Histories(
-        reports["log_likelihood"], reports["gradient"], greedy.reshape(*shape, -1).astype(np.int8),
-        error.reshape(shape), accuracy.reshape(shape),
-    )  # fmt: skip
+        reports["log_likelihood"],
+        reports["gradient"],
+        greedy.reshape(*shape, -1).astype(np.int8),
+        error.reshape(shape),
+        accuracy.reshape(shape),
+    )
 
 
 def sweeps(h: Histories, margin: float) -> dict[str, Sweep]:
-    """Every rule over its tolerances."""
-    runs, sessions = h.accuracy.shape
+    """Apply every rule over its tolerances."""
+    replications, sessions = h.accuracy.shape
     scale = float(h.error.max())
 
     def swept(name: str, unit: str, rule: Callable[[float], np.ndarray], rho: np.ndarray) -> Sweep:
         return sweep_tolerance(name, unit, rule, rho, h.accuracy, margin, TAIL)
 
     rows = [
-        swept("criterion 1: single step of likelihood", "nats",
-              partial(likelihood_change, h.log_likelihood), TOLERANCES),
-        swept("criterion 2: single step of learning error", "value",
-              partial(learning_error_change, h.error), TOLERANCES * scale),
+        swept(
+            "criterion 1: single step of likelihood",
+            "nats",
+            partial(likelihood_change, h.log_likelihood),
+            TOLERANCES,
+        ),
+        swept(
+            "criterion 2: single step of learning error",
+            "value",
+            partial(learning_error_change, h.error),
+            TOLERANCES * scale,
+        ),
         swept("single step of gradient", "nats", partial(likelihood_change, h.gradient), TOLERANCES),
-        swept("fixed number of sessions", "sessions", lambda n: np.full(runs, int(n)),
-              np.unique(np.geomspace(1, sessions, 60).round())),
-    ]  # fmt: skip
+        swept(
+            "fixed number of sessions",
+            "sessions",
+            lambda n: np.full(replications, int(n)),
+            np.unique(np.geomspace(1, sessions, 60).round()),
+        ),
+    ]
     for width in WIDTHS:
         rows += [
-            swept(f"likelihood, window of {width}", "nats",
-                  partial(moving_window, h.log_likelihood, width), TOLERANCES),
-            swept(f"gradient, window of {width}", "nats",
-                  partial(moving_window, h.gradient, width), TOLERANCES),
-            swept(f"policy, window of {width}", "share of states",
-                  partial(policy_window, h.greedy, width), SHARES),
-        ]  # fmt: skip
+            swept(
+                f"likelihood, window of {width}",
+                "nats",
+                partial(moving_window, h.log_likelihood, width),
+                TOLERANCES,
+            ),
+            swept(
+                f"gradient, window of {width}", "nats", partial(moving_window, h.gradient, width), TOLERANCES
+            ),
+            swept(
+                f"policy, window of {width}",
+                "share of states",
+                partial(policy_window, h.greedy, width),
+                SHARES,
+            ),
+        ]
     return {one.name: one for one in rows}
 
 
 def _told(v: Verdict) -> dict[str, Any]:
     low, high = v.interval()
     return {
-        "false stops": v.false_stops, "false rate": v.false_rate, "interval": [low, high], "stops": v.stops,
-        "mean sessions": float(v.used.mean()), "median sessions": float(np.median(v.used)),
-        "saved": v.saved, "accuracy given away": v.loss,
-    }  # fmt: skip
+        "false stops": v.false_stops,
+        "false rate": v.false_rate,
+        "interval": [low, high],
+        "stops": v.stops,
+        "mean sessions": float(v.used.mean()),
+        "median sessions": float(np.median(v.used)),
+        "saved": v.saved,
+        "accuracy given away": v.loss,
+    }
 
 
 def _ratios(single: Sweep, window: Sweep) -> dict[str, float]:
-    """False stops of the single step per false stop of the window, at each tolerance; at least 1 counted."""
+    """Divide false stops of the single step by those of the window, at each tolerance; at least 1 counted."""
     pairs = zip(window.rho, single.verdicts, window.verdicts, strict=True)
     return {f"{rho:.2g}": a.false_stops / max(b.false_stops, 1) for rho, a, b in pairs}
 
 
 DRAWN = (
-    "criterion 1: single step of likelihood", "criterion 2: single step of learning error",
-    "likelihood, window of 10", "likelihood, window of 20", "gradient, window of 10", "policy, window of 10",
-)  # fmt: skip
+    "criterion 1: single step of likelihood",
+    "criterion 2: single step of learning error",
+    "likelihood, window of 10",
+    "likelihood, window of 20",
+    "gradient, window of 10",
+    "policy, window of 10",
+)
 
 
-def _tell(every: dict[str, Sweep], sessions: int, runs: int) -> None:
+def _tell(every: dict[str, Sweep], sessions: int, replications: int) -> None:
     """Print the rules at three tolerances, and false stops of single step and windows at all of them."""
     columns = ("rule", "rho", "false stops", "stops", "mean sessions", "median", "saved")
     rows = []
@@ -147,7 +180,10 @@ def _tell(every: dict[str, Sweep], sessions: int, runs: int) -> None:
             v, rho = one.verdicts[i], f"{one.rho[i]:.2g} {one.unit}"
             used = (float(v.used.mean()), float(np.median(v.used)), f"{v.saved:.0%}")
             rows.append((name, rho, v.false_stops, v.stops, *used))
-    title = f"{runs} streams of {sessions} sessions; a false stop is {100 * MARGIN:g} points of LBA too early"
+    title = (
+        f"{replications} streams of {sessions} sessions; "
+        f"a false stop is {100 * MARGIN:g} points of LBA too early"
+    )
     print_table(title, columns, rows)
     names = ["criterion 1: single step of likelihood", *(f"likelihood, window of {w}" for w in WIDTHS)]
     print_table(
@@ -160,22 +196,26 @@ def _tell(every: dict[str, Sweep], sessions: int, runs: int) -> None:
     )
 
 
-def _draw(every: dict[str, Sweep], sessions: int, runs: int, folder: Path) -> None:
+def _draw(every: dict[str, Sweep], sessions: int, replications: int, folder: Path) -> None:
     note = (
         "a point a tolerance; bands: 95 % Wilson intervals; false: more than "
         f"{100 * MARGIN:g} points of LBA below what the stream settles at"
     )
     save_themes(
         lambda theme: stopping_plot(
-            [every[name] for name in DRAWN], control=every["fixed number of sessions"], theme=theme,
-            title=f"Stopping rules on {runs} streams of {sessions} sessions", note=note,
+            [every[name] for name in DRAWN],
+            control=every["fixed number of sessions"],
+            theme=theme,
+            title=f"Stopping rules on {replications} streams of {sessions} sessions",
+            note=note,
         ),
-        folder, "stopping",
-    )  # fmt: skip
+        folder,
+        "stopping",
+    )
 
 
 def main(
-    runs: Annotated[int, typer.Option(help="Streams.")] = 200,
+    replications: Annotated[int, typer.Option(help="Streams.")] = 200,
     sessions: Annotated[int, typer.Option(help="Sessions per stream.")] = 240,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
     reuse: Annotated[bool, typer.Option(help="Judge the streams of the last run again.")] = False,
@@ -187,17 +227,20 @@ def main(
     if reuse:
         with np.load(kept) as arrays:
             reports = dict(arrays)
-        runs, sessions = reports["log_likelihood"].shape
+        replications, sessions = reports["log_likelihood"].shape
     else:
-        reports = learn(patrol, runs, sessions, seed)
+        reports = learn(patrol, replications, sessions, seed)
         kept.parent.mkdir(parents=True, exist_ok=True)
         np.savez_compressed(kept, **reports)  # type: ignore[arg-type]
     h = histories(patrol, reports)
     settled = h.accuracy[:, -TAIL:].mean(1)
     results: dict[str, Any] = {
-        "runs": runs, "sessions": sessions, "seed": seed, "tail": TAIL,
+        "replications": replications,
+        "sessions": sessions,
+        "seed": seed,
+        "tail": TAIL,
         "settled accuracy": [float(x) for x in np.quantile(settled, [0, 0.5, 1])],
-    }  # fmt: skip
+    }
     for margin in (0.02, MARGIN, 0.1):
         every = sweeps(h, margin)
         single = every["criterion 1: single step of likelihood"]
@@ -213,8 +256,8 @@ def main(
             },
         }
         if margin == MARGIN:
-            _tell(every, sessions, runs)
-            _draw(every, sessions, runs, path.parent)
+            _tell(every, sessions, replications)
+            _draw(every, sessions, replications, path.parent)
     results["seconds"] = time.perf_counter() - began
     publish(path.stem, results, path)
 

@@ -26,7 +26,7 @@ from ...judging.returns import accuracy_of_cells, behaviour_accuracies
 
 
 class Plan(NamedTuple):
-    """How a task is learned.
+    """Settings with which a task is learned.
 
     Fields
     ------
@@ -116,7 +116,7 @@ _ASSUMED = 0.4
 
 @lru_cache(maxsize=8)
 def case(name: str, plan: Plan | None = None) -> Case:
-    """The task of that name; ``plan`` instead of its own. Raises ``ValueError`` for another name."""
+    """Make the task of that name; ``plan`` replaces its own. Raises ``ValueError`` for another name."""
     if name in ROBOTS:
         return _robot(name, plan or PLANS[name])
     if name == "mountain-car":
@@ -195,7 +195,7 @@ def _gaussian(environment: Any, plan: Plan) -> tuple[GaussianSensor, GaussianSen
 
 
 def _each(process: float | tuple[float, float], first: int, size: int) -> np.ndarray:
-    """A diagonal: one number for the first components, one for the rest."""
+    """Make a diagonal: one number for the first components, one for the rest."""
     return np.broadcast_to(process, (2,)).repeat([first, size - first])
 
 
@@ -235,7 +235,7 @@ def _mountain_car(plan: Plan) -> Case:
         200,
         (("position", "velocity (a step)"), (0, 1)),
         plan,
-    )  # fmt: skip
+    )
 
 
 # -- onions -------------------------------------------------------------------------------------------

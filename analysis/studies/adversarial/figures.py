@@ -50,18 +50,18 @@ def _style(theme: Theme, method: str) -> dict:
 
 
 def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
-    """LBA, return, or both against the pairs seen: a line a method, with the interval over seeds."""
+    """LBA, return, or both against the pairs seen: a line a method, with the interval over replications."""
     names = {"accuracy": "learned behaviour accuracy (LBA)", "returns": "return"}
     shown = [m for m in names if any(getattr(r, m) is not None for r in results.methods.values())]
     figure = new_figure(theme, 4.7 * len(shown) + 0.5 if len(shown) > 1 else 7.6, 4.6)
     panels = np.atleast_1d(figure.subplots(1, len(shown)))
     for panel, measure in zip(panels, shown, strict=True):
         for name, result in results.methods.items():
-            runs = getattr(result, measure)
-            if runs is None:
+            replications = getattr(result, measure)
+            if replications is None:
                 continue
-            style, band = _style(theme, name), seed_interval(runs)
-            if len(runs) > 1:
+            style, band = _style(theme, name), seed_interval(replications)
+            if len(replications) > 1:
                 top = 1.0 if measure == "accuracy" else np.inf
                 low = np.maximum(band.low, 0) if measure == "accuracy" else band.low
                 panel.fill_between(
@@ -76,7 +76,7 @@ def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
             panel.plot(
                 result.pairs, band.mean, label=name, linewidth=1.8, markersize=5, markevery=every, **style
             )
-        dress(panel, theme, x="reported state-action pairs seen", y=names[measure])
+        dress(panel, theme, x="observed state-action pairs", y=names[measure])
         panel.set_xlim(left=0)
         panel.xaxis.set_major_locator(MaxNLocator(6, integer=True))
         panel.xaxis.set_major_formatter(StrMethodFormatter("{x:,.0f}"))
@@ -98,13 +98,13 @@ def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
     handles = max((p.get_legend_handles_labels()[0] for p in panels), key=len)
     head(figure, theme, handles, title=results.title, columns=2)
     over = f"; LBA over {results.accuracy_over}" if "accuracy" in shown else ""
-    mean = f"line: mean of {counted(results.seeds, 'seed')}; band: its 95% interval (Student's)"
-    foot(figure, theme, ("line: one seed" if results.seeds == 1 else mean) + over)
+    mean = f"line: mean of {counted(results.replications, 'replication')}; band: its 95% interval (Student's)"
+    foot(figure, theme, ("line: one replication" if results.replications == 1 else mean) + over)
     return figure
 
 
 def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure:
-    """How much of what noise cost each domain robust-AIRL wins back, beside the dissertation's share."""
+    """Draw robust-AIRL's recovery of each domain's loss to noise, beside the dissertation's share."""
     rows = [
         (result, method, found)
         for result in results
@@ -119,10 +119,14 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
         style = _style(theme, method)
         if not math.isfinite(found.share):
             axes.annotate(
-                f"not known: noise cost something in {found.lost:.0%} of resamples", (0.03, y), va="center",
-                xycoords=axes.get_yaxis_transform(), color=style["color"], fontsize=SMALL,
+                f"not known: noise cost something in {found.lost:.0%} of resamples",
+                (0.03, y),
+                va="center",
+                xycoords=axes.get_yaxis_transform(),
+                color=style["color"],
+                fontsize=SMALL,
                 bbox={"boxstyle": "square,pad=0.2", "facecolor": theme.surface, "edgecolor": "none"},
-            )  # fmt: skip
+            )
             continue
         ends = np.clip([found.low, found.high], low, high)
         axes.plot(ends, [y, y], color=style["color"], linewidth=3, alpha=0.55, solid_capstyle="butt")
@@ -133,23 +137,40 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
         else:  # beyond the axis, and said so
             beyond = found.share > high
             axes.annotate(
-                f"{found.share:.0%}", (high if beyond else low, y), (-12 if beyond else 12, 0), va="center",
-                textcoords="offset points", ha="right" if beyond else "left", color=theme.ink, fontsize=SMALL,
-            )  # fmt: skip
+                f"{found.share:.0%}",
+                (high if beyond else low, y),
+                (-12 if beyond else 12, 0),
+                va="center",
+                textcoords="offset points",
+                ha="right" if beyond else "left",
+                color=theme.ink,
+                fontsize=SMALL,
+            )
         for end, cut in ((found.low, found.low < low), (found.high, found.high > high)):
             if cut:  # the interval goes on
                 axes.plot(
-                    np.clip(end, low, high), y, linestyle="", marker="<" if end < low else ">", markersize=7,
-                    color=style["color"], clip_on=False,
-                )  # fmt: skip
+                    np.clip(end, low, high),
+                    y,
+                    linestyle="",
+                    marker="<" if end < low else ">",
+                    markersize=7,
+                    color=style["color"],
+                    clip_on=False,
+                )
         printed = DISSERTATION_RECOVERY.get(result.domain)
         if printed is not None and method == ROBUST:
             axes.plot(
-                printed, y, linestyle="", marker="d", markersize=10, markerfacecolor="none",
-                markeredgecolor=theme.ink, markeredgewidth=1.5,
-            )  # fmt: skip
-    dress(axes, theme, x="share of what noise cost that is won back", grid="x")
-    # A domain's second row is told by its colour alone.
+                printed,
+                y,
+                linestyle="",
+                marker="d",
+                markersize=10,
+                markerfacecolor="none",
+                markeredgecolor=theme.ink,
+                markeredgewidth=1.5,
+            )
+    dress(axes, theme, x="share of the loss to noise recovered", grid="x")
+    # Only its colour marks a domain's second row.
     names = [
         "" if i and r is rows[i - 1][0] else f"{r.title}: {MEASURED[r.measure]}"
         for i, (r, _, _) in enumerate(rows)
@@ -165,20 +186,30 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
     ]
     if any(r.domain in DISSERTATION_RECOVERY for r, _, _ in rows):
         handles.append(
-            Line2D([], [], linestyle="", marker="d", markersize=10, markerfacecolor="none",
-                   markeredgecolor=theme.ink, markeredgewidth=1.5, label="dissertation, Table 7.3")
-        )  # fmt: skip
+            Line2D(
+                [],
+                [],
+                linestyle="",
+                marker="d",
+                markersize=10,
+                markerfacecolor="none",
+                markeredgecolor=theme.ink,
+                markeredgewidth=1.5,
+                label="dissertation, Table 7.3",
+            )
+        )
     handles.append(
         Line2D([], [], color=theme.ink, linewidth=1.2, linestyle=(0, (1, 1.5)), label=f"{_TARGET:.0%}")
     )
     head(figure, theme, handles, title="What robustness recovers", columns=2)
-    seeds = sorted({found.n for _, _, found in rows})
+    replications = sorted({found.n for _, _, found in rows})
     foot(
-        figure, theme,
-        "one seed a row, no interval"
-        if seeds == [1]
-        else f"bar: 95% interval, seeds drawn with replacement ({listed([str(n) for n in seeds])} seeds)",
-    )  # fmt: skip
+        figure,
+        theme,
+        "one replication a row, no interval"
+        if replications == [1]
+        else f"bar: 95% interval, bootstrap over {listed([str(n) for n in replications])} replications",
+    )
     return figure
 
 
@@ -199,27 +230,50 @@ def scatter_plot(scatters: Mapping[str, RewardScatter], theme: Theme, title: str
         )
         shades = theme.colormap(0.25 + 0.75 * (1 - scatter.whose / max(levels - 1, 1)))
         panel.scatter(
-            *scatter.trajectories.T, s=36, c=shades, marker=style["marker"], edgecolors=theme.ink,
-            linewidths=0.8, zorder=2,
-        )  # fmt: skip
+            *scatter.trajectories.T,
+            s=36,
+            c=shades,
+            marker=style["marker"],
+            edgecolors=theme.ink,
+            linewidths=0.8,
+            zorder=2,
+        )
         dress(panel, theme, x="true reward a step", y="learned reward a step")
         panel.set_title(
             f"{for_figure(name)}\nsteps: {_told(scatter.correlation.steps)}\n"
             f"trajectories: {_told(scatter.correlation.trajectories)}",
-            color=theme.ink, fontsize=TEXT, loc="left",
-        )  # fmt: skip
+            color=theme.ink,
+            fontsize=TEXT,
+            loc="left",
+        )
     for panel in panels[n:]:
         panel.set_visible(False)
     handles: list[Artist] = [
         Line2D([], [], linestyle="", marker="o", markersize=4, color=theme.muted, alpha=0.6, label="a step"),
-        Line2D([], [], linestyle="", marker="o", markersize=7, markerfacecolor=theme.colormap(1.0),
-               markeredgecolor=theme.ink, label="a trajectory's mean, the expert's policy"),
-    ]  # fmt: skip
+        Line2D(
+            [],
+            [],
+            linestyle="",
+            marker="o",
+            markersize=7,
+            markerfacecolor=theme.colormap(1.0),
+            markeredgecolor=theme.ink,
+            label="a trajectory's mean, the expert's policy",
+        ),
+    ]
     if levels > 1:
         handles.append(
-            Line2D([], [], linestyle="", marker="o", markersize=7, markerfacecolor=theme.colormap(0.25),
-                   markeredgecolor=theme.ink, label="the worst policy of the mix")
-        )  # fmt: skip
+            Line2D(
+                [],
+                [],
+                linestyle="",
+                marker="o",
+                markersize=7,
+                markerfacecolor=theme.colormap(0.25),
+                markeredgecolor=theme.ink,
+                label="the worst policy of the mix",
+            )
+        )
     head(figure, theme, handles, title=title, columns=3 if columns > 2 else 2)
     over = next(iter(scatters.values())).correlation
     foot(
@@ -241,7 +295,9 @@ def _told(found: Correlation) -> str:
 
 
 def belief_plot(belief: Belief, theme: Theme, title: str = "What happened, and what is believed") -> Figure:
-    """Components of a trajectory against time: reports, the truth, and the posterior's mean and band."""
+    """Draw a trajectory's components against time: observations, the truth, and the posterior's mean and
+    band.
+    """
     m = len(belief.names)
     columns = 1 if m < 3 else 2
     rows = -(-m // columns)
@@ -254,9 +310,14 @@ def belief_plot(belief: Belief, theme: Theme, title: str = "What happened, and w
         )
         panel.plot(steps, belief.mean[:, j], color=theme.series[0], linewidth=1.8)
         panel.plot(
-            steps, belief.reported[:, j], linestyle="", marker="x", markersize=4, markeredgewidth=1.1,
+            steps,
+            belief.observed[:, j],
+            linestyle="",
+            marker="x",
+            markersize=4,
+            markeredgewidth=1.1,
             color=theme.series[1],
-        )  # fmt: skip
+        )
         panel.plot(steps, belief.truth[:, j], color=theme.ink, linewidth=1.2, linestyle=(0, (4, 1.5)))
         dress(panel, theme, title=name)
         panel.title.set_fontsize(TEXT)
@@ -268,22 +329,33 @@ def belief_plot(belief: Belief, theme: Theme, title: str = "What happened, and w
         panel.tick_params(labelbottom=True)
         panel.xaxis.set_major_locator(MaxNLocator(8, integer=True))
     handles: list[Artist] = [
-        Line2D([], [], linestyle="", marker="x", markersize=6, markeredgewidth=1.4, color=theme.series[1],
-               label="reported"),
+        Line2D(
+            [],
+            [],
+            linestyle="",
+            marker="x",
+            markersize=6,
+            markeredgewidth=1.4,
+            color=theme.series[1],
+            label="observed",
+        ),
         Line2D([], [], color=theme.ink, linewidth=1.3, linestyle=(0, (4, 1.5)), label="truth"),
         Line2D([], [], color=theme.series[0], linewidth=1.8, label="posterior mean"),
         Patch(color=theme.series[0], alpha=0.28, linewidth=0, label=f"its middle {belief.coverage:.0%}"),
-    ]  # fmt: skip
+    ]
     head(figure, theme, handles, title=title, columns=4)
     inside = np.mean((belief.low <= belief.truth) & (belief.truth <= belief.high))
-    reported, believed = (np.sum((x - belief.truth) ** 2, 0) for x in (belief.reported, belief.mean))
-    wrong = reported > 0
-    errors = np.sqrt(believed[wrong] / reported[wrong]).mean() if wrong.any() else np.nan
-    left = f"; its mean errs {errors:.0%} as much as the reports (root mean square)" if wrong.any() else ""
+    observed, believed = (np.sum((x - belief.truth) ** 2, 0) for x in (belief.observed, belief.mean))
+    wrong = observed > 0
+    errors = np.sqrt(believed[wrong] / observed[wrong]).mean() if wrong.any() else np.nan
+    left = (
+        f"; its mean errs {errors:.0%} as much as the observations (root mean square)" if wrong.any() else ""
+    )
     foot(
-        figure, theme,
+        figure,
+        theme,
         f"{inside:.0%} of the truth is inside the band{left}",
-    )  # fmt: skip
+    )
     return figure
 
 
@@ -299,9 +371,15 @@ def cells_plot(
     panels = np.atleast_1d(figure.subplots(1, n, sharey=True))
     for panel, (name, share) in zip(panels, cells.items(), strict=True):
         picture = panel.imshow(
-            share.T, origin="lower", extent=(low[0], high[0], low[1], high[1]), aspect="auto",
-            cmap=theme.colormap, vmin=0, vmax=1, interpolation="nearest",
-        )  # fmt: skip
+            share.T,
+            origin="lower",
+            extent=(low[0], high[0], low[1], high[1]),
+            aspect="auto",
+            cmap=theme.colormap,
+            vmin=0,
+            vmax=1,
+            interpolation="nearest",
+        )
         dress(panel, theme, x="position", grid=None)
         panel.set_title(f"{name}\nmean {share.mean():.0%}", color=theme.ink, fontsize=TEXT, loc="left")
         panel.tick_params(axis="y", left=panel is panels[0])
@@ -316,7 +394,7 @@ def cells_plot(
 
 
 def frames_plot(strips: Sequence[FrameStrip], theme: Theme, title: str = "") -> Figure:
-    """A row of moments for each episode, seen from the side; time and distance under each."""
+    """Draw a row of moments for each episode, seen from the side; time and distance under each."""
     moments = max(len(s.seconds) for s in strips)
     shapes = [_outlines(s) for s in strips]
     width = 1.08 * max(float(np.ptp(s[..., 0], axis=(1, 2)).max()) for s in shapes)
@@ -333,10 +411,14 @@ def frames_plot(strips: Sequence[FrameStrip], theme: Theme, title: str = "") -> 
                 placed = limb + np.array([k * width - middle, 0.0])
                 panel.add_patch(
                     Polygon(
-                        placed, closed=True, facecolor=color, edgecolor=theme.surface, linewidth=0.8,
+                        placed,
+                        closed=True,
+                        facecolor=color,
+                        edgecolor=theme.surface,
+                        linewidth=0.8,
                         zorder=2 + j,
                     )
-                )  # fmt: skip
+                )
         dress(panel, theme, title=strip.name, grid=None)
         panel.set_xticks(
             np.arange(len(strip.seconds)) * width,

@@ -1,6 +1,6 @@
-"""The study of adversarial learners told: tables beside the dissertation's, figures, and the report.
+"""Page of the study of adversarial learners: tables beside the dissertation's, and figures.
 
-:func:`write` takes what a study came to, one
+:func:`write` takes a study's results, one
 :class:`~i2rl.analysis.studies.adversarial.results.AdversarialResults` a domain.
 """
 
@@ -51,9 +51,7 @@ TABLE_7_4 = {
     "half-cheetah": {CLEAN: 0.96, NOISY: 0.86, ROBUST: 0.94, SSRR: 0.87},
 }
 """Pearson's correlation of learned and true rewards."""
-TABLE_7_5 = {
-    CLEAN: (0.907, 0.726, 0.199), NOISY: (0.889, 0.625, 0.297), ROBUST: (0.843, 0.637, 0.243)
-}  # fmt: skip
+TABLE_7_5 = {CLEAN: (0.907, 0.726, 0.199), NOISY: (0.889, 0.625, 0.297), ROBUST: (0.843, 0.637, 0.243)}
 """``V_demo``, ``V_gen`` and empirical ILE, on data of 64 dimensions that were never released."""
 LBA_LOST = {"patrol": 0.20, "mountain-car": 0.22}
 """Relative drop of LBA by noise (section 7.4.3)."""
@@ -71,15 +69,17 @@ def learning_table(results: AdversarialResults) -> Table:
     printed = TABLE_7_3.get(results.domain)
     measures = [m for m in ("accuracy", "returns") if any(_has(r, m) for r in results.methods.values())]
     heads = {"accuracy": "LBA, %", "returns": "return"}
-    headings = ["method", "seeds", *(heads[m] for m in measures)] + ["dissertation"] * (printed is not None)
+    headings = ["method", "replications", *(heads[m] for m in measures)] + ["dissertation"] * (
+        printed is not None
+    )
     rows: list[list[str]] = []
     if results.expert_return is not None and "returns" in measures:
         cells = {"accuracy": "100", "returns": f"{results.expert_return:,.{_digits(results.expert_return)}f}"}
         rows.append([EXPERT, _NONE, *(cells[m] for m in measures)])
     for name in results.methods:
         late = {m: results.late(name, m) for m in measures}
-        seeds = max((len(x) for x in late.values() if x is not None), default=0)
-        rows.append([name, f"{seeds}", *(_late(late[m], m) for m in measures)])
+        replications = max((len(x) for x in late.values() if x is not None), default=0)
+        rows.append([name, f"{replications}", *(_late(late[m], m) for m in measures)])
     if printed is not None:
         for row in rows:
             row.append(f"{printed[row[0]]:,}" if row[0] in printed else _NONE)
@@ -89,7 +89,7 @@ def learning_table(results: AdversarialResults) -> Table:
     return Table(
         headings,
         rows,
-        f"Mean of the last {kept} of {counted(sessions, 'session')} (95 % interval over seeds)."
+        f"Mean of the last {kept} of {counted(sessions, 'session')} (95 % interval over replications)."
         + "".join(
             f" {name} learned from as much in {counted(len(results.methods[name].pairs), 'session')}."
             for name in fewer
@@ -100,7 +100,7 @@ def learning_table(results: AdversarialResults) -> Table:
 
 
 def recovery_table(results: AdversarialResults) -> Table:
-    """What noise costs and what is won back, as the dissertation computes both."""
+    """Tabulate the loss to noise and its recovery, as the dissertation computes both."""
     measure = figures.MEASURED[results.measure]
     clean, noisy = (results.late(name, results.measure) for name in (CLEAN, NOISY))
     rows: list[tuple[str, str, str]] = []
@@ -109,7 +109,7 @@ def recovery_table(results: AdversarialResults) -> Table:
         if results.domain in TABLE_7_3:
             table = TABLE_7_3[results.domain]
             printed = 1 - table[NOISY] / table[CLEAN]
-        lost = f"{round(1 - noisy.mean() / clean.mean(), 2) + 0.0:.0%}"  # nothing is not less than nothing
+        lost = f"{round(1 - noisy.mean() / clean.mean(), 2) + 0.0:.0%}"  # no bound below zero
         rows.append((f"{measure} lost to noise", lost, _NONE if printed is None else f"{printed:.0%}"))
         robust = results.late(ROBUST, results.measure)
         if robust is not None:
@@ -119,12 +119,12 @@ def recovery_table(results: AdversarialResults) -> Table:
         if found is not None:
             share = _printed_recovery(results.domain, name)
             printed_cell = _NONE if share is None else f"{share:.0%}"
-            rows.append((f"of that won back by {name}", _recovered(found), printed_cell))
+            rows.append((f"of that recovered by {name}", _recovered(found), printed_cell))
     return Table(
         ("", "measured", "dissertation"),
         rows,
-        f"Lost: (clean - noisy) / clean of mean {measure}. Won back: (robust - noisy) / (clean - noisy), "
-        "with a 95 % interval by drawing seeds with replacement, which of few seeds is too narrow.",
+        f"Lost: (clean - noisy) / clean of mean {measure}. Recovered: (robust - noisy) / (clean - noisy), "
+        "with a 95 % interval by a bootstrap over replications, too narrow for few replications.",
     )
 
 
@@ -141,15 +141,25 @@ def correlation_table(results: AdversarialResults) -> Table:
             cells += [f"{sum(c.n for c in found):,}", *_correlated(found)]
         rows.append((*cells, f"{printed[name]:.2f}" if name in printed else _NONE))
     return Table(
-        ("method", "seeds", "steps", "Pearson", "Spearman", "trajectories", "Pearson", "Spearman",
-         "dissertation"),
+        (
+            "method",
+            "replications",
+            "steps",
+            "Pearson",
+            "Spearman",
+            "trajectories",
+            "Pearson",
+            "Spearman",
+            "dissertation",
+        ),
         rows,
         "Learned against true reward on held-out episodes of a mix of policies, from the expert's to a "
         "uniform one; trajectories by their sums, over equally long episodes unless the task itself ends "
-        "them. Mean over seeds and Student's 95 % interval (of one seed: drawing whole trajectories with "
+        "them. Mean over replications and Student's 95 % interval (of one replication: a bootstrap of "
+        "trajectories with "
         "replacement); none where a reward is the same in all steps. The dissertation's (Table 7.4, Pearson) "
         "come with p-values that fit 4 to 7 points each.",
-    )  # fmt: skip
+    )
 
 
 def ile_table(results: AdversarialResults) -> Table:
@@ -189,10 +199,10 @@ def breach_table(results: AdversarialResults) -> Table:
             told = _NONE if printed is None else f"{100 * printed[0]:.0f} to {100 * printed[1]:.0f}"
             rows.append((name, f"{len(result.breaches)}", _percent_with_interval(result.breaches), told))
     return Table(
-        ("method", "seeds", "breaches that succeed, %", "dissertation"),
+        ("method", "replications", "breaches that succeed, %", "dissertation"),
         rows,
         "With what was learned in the last session, or the expert's own policy, for all patrollers; 95 % "
-        "interval over seeds.",
+        "interval over replications.",
     )
 
 
@@ -206,29 +216,33 @@ def _has(result: MethodResult, measure: str) -> bool:
     return getattr(result, measure) is not None
 
 
-def _late(runs: Float[np.ndarray, " seeds"] | None, measure: str) -> str:
-    if runs is None:
+def _late(replications: Float[np.ndarray, " replications"] | None, measure: str) -> str:
+    if replications is None:
         return _NONE
-    return _percent_with_interval(runs) if measure == "accuracy" else _with_interval(runs, 1, _digits(runs))
+    return (
+        _percent_with_interval(replications)
+        if measure == "accuracy"
+        else _with_interval(replications, 1, _digits(replications))
+    )
 
 
 def _digits(returns: Any) -> int:
-    """A robot's returns are thousands, those of sorting a few."""
+    """Choose the digits of a return: a robot's returns are thousands, those of sorting a few."""
     return 0 if np.abs(returns).max() >= 100 else 2
 
 
-def _percent_with_interval(shares: Float[np.ndarray, " seeds"]) -> str:
-    """Student's interval of a few seeds knows nothing of the ends of a scale."""
+def _percent_with_interval(shares: Float[np.ndarray, " replications"]) -> str:
+    """Format Student's interval of a few replications, cut at the ends of the scale."""
     return _with_interval(shares, 100, within=(0, 100))
 
 
 def _with_interval(
-    runs: Float[np.ndarray, " seeds"],
+    replications: Float[np.ndarray, " replications"],
     scale: float = 1.0,
     digits: int = 1,
     within: tuple[float, float] = (-math.inf, math.inf),
 ) -> str:
-    band = seed_interval(scale * np.asarray(runs, float))
+    band = seed_interval(scale * np.asarray(replications, float))
     if np.isnan(band.mean):
         return _NONE
     if np.isnan(band.low):
@@ -260,9 +274,9 @@ def _correlated(found: Sequence[Correlation]) -> tuple[str, str]:
 def _recovered(found: Recovery) -> str:
     if found.lost < 1 and not (math.isfinite(found.low) and math.isfinite(found.high)):
         told = "not known" if found.lost < 0.5 else f"{found.share:.0%}, interval not known"
-        return f"{told}: noise cost something in {found.lost:.0%} of resamples only"
+        return f"{told}: noise had a cost in {found.lost:.0%} of resamples only"
     if found.n == 1:
-        return f"{found.share:.0%} (one seed, no interval)"
+        return f"{found.share:.0%} (one replication, no interval)"
     return f"{found.share:.0%} ({found.low:.0%} to {found.high:.0%})"
 
 
@@ -296,11 +310,11 @@ def print_tables(results: AdversarialResults, console: Console) -> None:
 
 
 def summary(results: AdversarialResults) -> dict[str, Any]:
-    """Settings and all measures as plain data, seeds apart."""
+    """Return settings and all measures as plain data, one entry a replication."""
     return {
         "domain": results.domain,
         "noise": results.noise,
-        "seeds": results.seeds,
+        "replications": results.replications,
         "machine": results.machine,
         "settings": dict(results.settings),
         "accuracy over": results.accuracy_over,
@@ -403,14 +417,14 @@ def _lead(all_results: Sequence[AdversarialResults]) -> Lead:
         if found is not None:
             known = found.lost == 1 and math.isfinite(found.share)
             trust.append(
-                f"in {name} {_recovered(found)} of what noise cost is won back"
+                f"in {name} {_recovered(found)} of the loss to noise is recovered"
                 if known
-                else f"in {name} these runs do not show that noise cost anything"
+                else f"in {name} these replications do not show that noise cost anything"
             )
-    seeds = min(results.seeds for results in all_results)
-    few = f"Trust no difference as long as there is {counted(seeds, 'seed')} only"
-    if seeds > 1:
-        few = f"Trust differences beyond the spread of {counted(seeds, 'seed')}"
+    replications = min(results.replications for results in all_results)
+    few = f"Trust no difference as long as there is {counted(replications, 'replication')} only"
+    if replications > 1:
+        few = f"Trust differences beyond the spread of {counted(replications, 'replication')}"
     return Lead(
         "Rewards were learned as networks, so there are no weights to list; after the last sessions they "
         f"reach {'; '.join(learned)}.",
@@ -420,7 +434,7 @@ def _lead(all_results: Sequence[AdversarialResults]) -> Lead:
 
 
 def _recovery_section(all_results: Sequence[AdversarialResults], folder: Path) -> Section:
-    told = "Of what noise takes from AIRL, the share that a learner wins back who reckons with the noise."
+    told = "Share of AIRL's loss to noise that a learner with a noise model recovers."
     picture = drawn(folder, "recovery", partial(figures.recovery_plot, all_results), told, told)
     return Section("What robustness recovers", "", [], [picture])
 
@@ -432,7 +446,8 @@ def _strip_section(strip: Strip, mdp: TabularMDP, folder: Path, i: int) -> Secti
         folder,
         f"strip-{i}",
         partial(strip_plot, strip, mdp),
-        "A new trajectory with a misreport, as robust-AIRL of the first seed understands it in the end.",
+        "A new trajectory with a wrong observation, completed by the last robust-AIRL of the first "
+        "replication.",
         "Grid of pairs against steps shaded by posterior probability, with what was seen and what happened",
     )
     return Section("What one learner believes of a trajectory", "", [], [picture])
@@ -449,8 +464,9 @@ _NOTES = {
 
 def _text(results: AdversarialResults) -> str:
     told = (
-        f"The expert's states and actions are reported with noise: {results.noise}. "
-        f"{counted(results.seeds, 'independent seed')}; all methods of a seed see the same demonstrations "
+        f"The expert's states and actions are observed with noise: {results.noise}. "
+        f"{counted(results.replications, 'independent replication')}; "
+        "all methods of a replication see the same demonstrations "
         "and have equal budgets."
     )
     return "\n\n".join([told, *([_NOTES[results.domain]] if results.domain in _NOTES else [])])
@@ -463,44 +479,49 @@ def _sections(results: AdversarialResults, folder: Path) -> list[Section]:
         return drawn(folder, f"{results.domain}-{name}", draw, told, description)
 
     learning = picture(
-        "learning", partial(figures.learning_plot, results),
+        "learning",
+        partial(figures.learning_plot, results),
         "Learning against the pairs seen (Figures 7.11 to 7.13). Axes need not begin at zero.",
-        "Learned behaviour accuracy or return against reported pairs, a line a method",
-    )  # fmt: skip
+        "Learned behaviour accuracy or return against observed pairs, a line a method",
+    )
     first = [tables[name] for name in ("recovery", "breaches", "errors") if name in tables]
     sections = [Section(results.title, _text(results), first, [learning])]
     if results.cells:
         cells = picture(
-            "cells", partial(figures.cells_plot, results.cells, *_MOUNTAIN_CAR),
-            "LBA in each cell of the space of states, mean over seeds; many cells are never visited.",
+            "cells",
+            partial(figures.cells_plot, results.cells, *_MOUNTAIN_CAR),
+            "LBA in each cell of the space of states, mean over replications; many cells are never visited.",
             "Maps of position and velocity shaded by the share of actions equal to the expert's",
-        )  # fmt: skip
+        )
         sections.append(Section(f"{results.title}: where", "", [], [cells]))
     if "rewards" in tables or results.scatters:
         pictures = []
         if results.scatters:
             title = f"Learned and true rewards, {results.title}"
             scatter = picture(
-                "rewards", partial(figures.scatter_plot, results.scatters, title=title),
-                "Learned against true rewards of the first seed. A learned reward has its own scale.",
+                "rewards",
+                partial(figures.scatter_plot, results.scatters, title=title),
+                "Learned against true rewards of the first replication. A learned reward has its own scale.",
                 "Learned reward against true reward, a panel a method",
-            )  # fmt: skip
+            )
             pictures.append(scatter)
         rewards = [tables["rewards"]] if "rewards" in tables else []
         sections.append(Section(f"{results.title}: rewards", "", rewards, pictures))
     if results.belief is not None:
         belief = picture(
-            "belief", partial(figures.belief_plot, results.belief),
-            "A noisy trajectory as robust-AIRL of the first seed understands it in the end.",
-            "Reports, truth and posterior band of a trajectory's components against time",
-        )  # fmt: skip
+            "belief",
+            partial(figures.belief_plot, results.belief),
+            "A noisy trajectory completed by the last robust-AIRL of the first replication.",
+            "Observations, truth and posterior band of a trajectory's components against time",
+        )
         sections.append(Section(f"{results.title}: what is believed of the truth", "", [], [belief]))
     if results.frames:
         frames = picture(
-            "frames", partial(figures.frames_plot, results.frames),
+            "frames",
+            partial(figures.frames_plot, results.frames),
             "Moments of an episode of the expert and of what was learned, from the same kind of start.",
             "Rows of silhouettes of the robot at even times",
-        )  # fmt: skip
+        )
         sections.append(Section(f"{results.title}: motion", "", [], [frames]))
     if "pace" in tables:
         sections.append(Section(f"{results.title}: time", "", [tables["pace"]]))

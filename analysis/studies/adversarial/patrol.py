@@ -1,13 +1,13 @@
-"""Adversarial learners on patrol through reports that err (section 7.4.3, Figure 7.11).
+"""Adversarial learners on patrol with noisy observations (section 7.4.3, Figure 7.11).
 
 Instance 2, its greedy expert (the dissertation's is a rule by hand), trajectories of 8 pairs from anywhere,
-sessions of 32 to 128 pairs. Moving forward is reported as turning left, and turning right as moving forward;
-states are never wrong. All is exact: the posterior of the truth behind a report, and the generator's plan.
+sessions of 32 to 128 pairs. Moving forward is observed as turning left, and turning right as moving forward;
+states are always right. The posterior of the truth behind an observation and the generator's plan are exact.
 
-:func:`patrol_results` is the study behind ``i2rl run robust-airl --domain patrol``. Networks alone are
-carried from session to session there, as in the dissertation (``forgetting`` of 0): with the statistic of
-earlier sessions that these learners keep by default, noise of 5 % costs next to nothing and there is nothing
-to recover. :mod:`~i2rl.analysis.benchmarks.statistics.adversarial_patrol` measures both.
+:func:`patrol_results` is the study behind ``i2rl run robust-airl --domain patrol``. Only networks pass from
+session to session there, as in the dissertation (``forgetting`` of 0): with the default statistic of earlier
+sessions, noise of 5 % costs almost nothing, which leaves nothing to recover.
+:mod:`~i2rl.analysis.benchmarks.statistics.adversarial_patrol` measures both.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ LEVEL = 0.05
 ASSUMED = 0.15
 """Probability of both confusions that a learner of the sensor begins with."""
 
-MISREPORT, POLICY = "probability of a misreport", "policy of robust-AIRL, first seed"
+MISREPORT, POLICY = "probability of a wrong observation", "policy of robust-AIRL, first replication"
 """Settings of the results from which :func:`believed_trajectories` are drawn."""
 
 
@@ -56,7 +56,7 @@ MISREPORT, POLICY = "probability of a misreport", "policy of robust-AIRL, first 
 
 
 class Streams(NamedTuple):
-    """The same sessions as they happened and as they were reported, ``[R, T, n, L]``; ``pairs [T]`` seen."""
+    """True and observed sessions, ``[R, T, n, L]``; ``pairs [T]`` seen."""
 
     truth: Demonstration
     seen: Demonstration
@@ -66,14 +66,14 @@ class Streams(NamedTuple):
 
 
 def confusions_of(patrol: Patrol, forward_as_left: float, right_as_forward: float) -> Confusions:
-    """The two confusions of section 7.4.3."""
+    """Return the two confusions of section 7.4.3."""
     kinds = [(FORWARD, LEFT), (RIGHT, FORWARD)]
     chances = np.array([forward_as_left, right_as_forward])
     return Confusions.of_actions(patrol.mdp.n_states, kinds, chances, patrol.mdp.n_actions)
 
 
-def noisy_streams(patrol: Patrol, level: float, runs: int, sessions: int, seed: int = 0) -> Streams:
-    """Reports of the patroller's greedy expert; the truth is the same at every level."""
+def noisy_streams(patrol: Patrol, level: float, replications: int, sessions: int, seed: int = 0) -> Streams:
+    """Simulate observations of the patroller's greedy expert; the truth is the same at every level."""
     confusions = confusions_of(patrol, level, level)
     sensor = Sensor(None, confusions.noise)
     log_policy = jnp.log(jnp.asarray(patrol.expert_policy()))
@@ -83,11 +83,13 @@ def noisy_streams(patrol: Patrol, level: float, runs: int, sessions: int, seed: 
         states, actions = simulate(act, patrol.mdp, log_policy, STEPS)
         return states, actions, observe(look, sensor, states, actions)
 
-    keys = jax.random.split(jax.random.key(seed), runs * sessions * MOST)
+    keys = jax.random.split(jax.random.key(seed), replications * sessions * MOST)
     states, actions, codes = jax.jit(partial(jax.lax.map, one, batch_size=64))(keys)
-    # Sizes are those of all runs, so that curves share their axis.
+    # Sizes are those of all replications, so that curves share their axis.
     sizes = np.random.default_rng(seed).integers(LEAST, MOST + 1, sessions)
-    there = np.broadcast_to((np.arange(MOST) < sizes[:, None])[..., None], (runs, sessions, MOST, STEPS))
+    there = np.broadcast_to(
+        (np.arange(MOST) < sizes[:, None])[..., None], (replications, sessions, MOST, STEPS)
+    )
 
     def shaped(demonstration: Demonstration) -> Demonstration:
         arrays = (np.asarray(x).reshape(there.shape) for x in demonstration.arrays)
@@ -105,7 +107,7 @@ def noisy_streams(patrol: Patrol, level: float, runs: int, sessions: int, seed: 
 
 
 def noise_learners(patrol: Patrol, sensor: Sensor) -> dict[str, Callable[..., Learner]]:
-    """What makes the learner of each method, given options; only AIRL on clean input is to see the truth."""
+    """Return each method's factory of learners, given options; only AIRL on clean input sees the truth."""
     mdp = patrol.mdp
     return {
         CLEAN: partial(airl_tabular, mdp),
@@ -116,7 +118,7 @@ def noise_learners(patrol: Patrol, sensor: Sensor) -> dict[str, Callable[..., Le
 
 
 def greedy_policy_of(mdp: TabularMDP, state: Any) -> Float[Array, "S A"]:
-    """The likeliest actions of what a learner has learned, adversarial or with weights of features."""
+    """Compute the likeliest actions of a learned policy, adversarial or with weights of features."""
     if hasattr(state, "log_policy"):
         return jax.nn.one_hot(jnp.argmax(state.log_policy, axis=1), mdp.n_actions)
     return deterministic_policy(hard_plan(mdp, reward_of(mdp, state.weights)).optimal)
@@ -154,23 +156,28 @@ def outcome_of(patrol: Patrol, learner: Learner, streams: Demonstration, seed: i
 def success_rates(
     patrol: Patrol, policies: Float[np.ndarray, "R S A"], trials: int, seed: int = 2
 ) -> Float[np.ndarray, " R"]:
-    """Share of breaches that reach the goal unseen, with each run's policy for both patrollers.
+    """Compute the share of breaches that reach the goal undetected, with each replication's policy for both
+    patrollers.
 
-    Everything is in view and read rightly while the learner waits: what differs is the policy alone.
+    The learner observes everything exactly while it waits, so only the policies differ.
     """
     rates = []
     for i, policy in enumerate(policies):
         both = jnp.broadcast_to(jnp.log(jnp.asarray(policy)), (patrol.patrollers, *policy.shape))
         outcome = breach_trials(
-            jax.random.fold_in(jax.random.key(seed), i), patrol, both, observability=100,
-            observed_steps=STEPS, trials=trials,
-        )  # fmt: skip
+            jax.random.fold_in(jax.random.key(seed), i),
+            patrol,
+            both,
+            observability=100,
+            observed_steps=STEPS,
+            trials=trials,
+        )
         rates.append(outcome.rate())
     return np.array(rates)
 
 
 def interval(values: Float[np.ndarray, "R ..."]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over runs, and half the width of its 95 % interval (Student), zero for one run."""
+    """Mean over replications, and half the width of its 95 % interval (Student), zero for one run."""
     band = seed_interval(values)
     return band.mean, np.nan_to_num(band.high - band.mean)
 
@@ -188,7 +195,7 @@ class _Run(NamedTuple):
 
 
 def patrol_results(
-    seeds: int,
+    replications: int,
     sessions: int | None = None,
     noise: float = 1.0,
     *,
@@ -196,38 +203,40 @@ def patrol_results(
     iterations: int = 30,
     advance: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> AdversarialResults:
-    """AIRL on the truth and on reports, and robust-AIRL with the sensor given or learned.
+    """Run AIRL on the truth and on observations, and robust-AIRL with the sensor given or learned.
 
     Parameters
     ----------
-    seeds : int
+    replications : int
     sessions : int, optional
         35 by default.
     noise : float
         Times the 5 % of both confusions.
     trials : int
-        Breaches tried with each learned policy.
+        Breaches simulated with each learned policy.
     iterations : int
         Of discriminator and generator in a session.
     advance : callable
-        Told what was done, and what share of all.
+        Called with a description and the share done.
 
     Raises
     ------
     ValueError
-        For fewer than one seed, session or trial, and for noise that makes no probability of the confusions.
+        For fewer than one replication, session or trial, and for noise that gives no probability of the
+        confusions.
     """
     sessions = SESSIONS if sessions is None else sessions
-    for count, what in ((seeds, "seed"), (sessions, "session"), (trials, "trial of a breach")):
+    for count, what in ((replications, "seed"), (sessions, "session"), (trials, "trial of a breach")):
         if operator.index(count) < 1:
             raise ValueError(f"there must be at least one {what}, got {count}")
     if not 0 < noise * LEVEL <= 1:
         raise ValueError(
-            f"noise multiplies the probability of {LEVEL:g} that a report errs, so that it is above 0 and at "
+            f"noise multiplies the probability of {LEVEL:g} that an observation errs; it must be "
+            f"above 0 and at "
             f"most {1 / LEVEL:g}; got {noise}"
         )
     level, patrol = noise * LEVEL, instance(2)
-    streams = noisy_streams(patrol, level, seeds, sessions)
+    streams = noisy_streams(patrol, level, replications, sessions)
     learners = {
         name: make(forgetting=0.0, iterations=iterations)
         for name, make in noise_learners(patrol, streams.sensor).items()
@@ -236,29 +245,29 @@ def patrol_results(
     methods, noises, first = {}, [], np.zeros(0)
     for i, (name, learner) in enumerate(learners.items()):
         given = streams.truth if name == CLEAN else streams.seen
-        runs = []
-        for seed in range(seeds):
-            runs.append(_run(patrol, learner, _at(given, seed), seed))
-            share = (i + (seed + 1) / seeds) / len(learners)
-            advance(f"{name}, seed {seed}: LBA {runs[-1].accuracy[-1]:.1%}", share)
-        policies = np.array([greedy_policy_of(patrol.mdp, r.state) for r in runs])
+        repeats = []
+        for seed in range(replications):
+            repeats.append(_run(patrol, learner, _at(given, seed), seed))
+            share = (i + (seed + 1) / replications) / len(learners)
+            advance(f"{name}, seed {seed}: LBA {repeats[-1].accuracy[-1]:.1%}", share)
+        policies = np.array([greedy_policy_of(patrol.mdp, r.state) for r in repeats])
         methods[name] = MethodResult(
             streams.pairs,
-            np.array([r.accuracy for r in runs]),
+            np.array([r.accuracy for r in repeats]),
             breaches=success_rates(patrol, policies, trials),
-            seconds=float(np.median([r.seconds[1:] for r in runs])) if sessions > 1 else None,
+            seconds=float(np.median([r.seconds[1:] for r in repeats])) if sessions > 1 else None,
         )
         if name == ROBUST:
-            first = np.exp(np.asarray(runs[0].state.log_policy))
+            first = np.exp(np.asarray(repeats[0].state.log_policy))
         if name == LEARNED:
-            noises = [r.noise.tolist() for r in runs]
-    true = np.broadcast_to(patrol.expert_policy(), (seeds, *first.shape))
+            noises = [r.noise.tolist() for r in repeats]
+    true = np.broadcast_to(patrol.expert_policy(), (replications, *first.shape))
     percent = f"{100 * level:.3g} %"
     return AdversarialResults(
         "patrol",
-        f"moving forward is reported as turning left, and turning right as moving forward, {percent} of the "
-        "time each; states are reported rightly",
-        seeds,
+        f"moving forward is observed as turning left, and turning right as moving forward, {percent} of the "
+        "time each; states are observed correctly",
+        replications,
         "",
         methods,
         accuracy_over=f"all {patrol.mdp.n_states} states",
@@ -268,8 +277,8 @@ def patrol_results(
             "iterations": iterations,
             "memory of earlier sessions": 0.0,
             "trials of a breach, a policy": trials,
-            "probability of a misreport, before it is learned": ASSUMED,
-            "learned probabilities of misreports, a row a seed": noises,
+            "probability of a wrong observation, before learning": ASSUMED,
+            "learned probabilities of wrong observations, a row a replication": noises,
             POLICY: first.round(6).tolist(),
         },
         expert_breaches=float(success_rates(patrol, true, trials).mean()),
@@ -289,17 +298,17 @@ def _run(patrol: Patrol, learner: Learner, sessions: Demonstration, seed: int) -
 
 
 def _at(demonstrations: Demonstration, place: Any) -> Demonstration:
-    """The part of arrays with leading axes."""
+    """Select the part of arrays with leading axes."""
     return Demonstration(*(np.asarray(x)[place] for x in demonstrations.arrays))
 
 
 def believed_trajectories(results: AdversarialResults) -> Sequence[tuple[Strip, TabularMDP]]:
-    """A new trajectory as robust-AIRL of the first seed understands it in the end; it has a misreport.
+    """Complete a new trajectory with an error by robust-AIRL of the first replication, after learning.
 
-    None if no report errs in 64 sessions.
+    None if every observation is right in 64 sessions.
     """
     patrol, level = instance(2), results.settings[MISREPORT]
-    streams = noisy_streams(patrol, level, runs=1, sessions=64, seed=1)
+    streams = noisy_streams(patrol, level, replications=1, sessions=64, seed=1)
     wrong = (streams.seen.action != streams.truth.action).any(-1)
     if not wrong.any():
         return ()

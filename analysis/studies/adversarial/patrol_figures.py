@@ -1,4 +1,4 @@
-"""Pictures of the patrol studies of adversarial learners: reports that err, and steps that are hidden.
+"""Figures of the patrol studies of adversarial learners: noisy observations and hidden steps.
 
 All draw the results of :mod:`i2rl.analysis.benchmarks.statistics.adversarial_patrol`.
 """
@@ -34,11 +34,15 @@ from .patrol import interval
 Results = Mapping[str, Mapping[str, Any]]
 
 CLEAN, NOISY, ROBUST, LEARNED, LME = (
-    "AIRL, clean input", "AIRL, noisy input", "robust-AIRL", "robust-AIRL, sensor learned", "LME-I2RL",
-)  # fmt: skip
+    "AIRL, clean input",
+    "AIRL, noisy input",
+    "robust-AIRL",
+    "robust-AIRL, sensor learned",
+    "LME-I2RL",
+)
 GAIL, ROBUST_GAIL = "online GAIL", "GAIL, hidden steps in expectation"
 LAST = 15
-# Section 7.4.3: success of AIRL and of robust-AIRL on noisy reports, 95 % ranges.
+# Section 7.4.3: success of AIRL and of robust-AIRL on noisy observations, 95 % ranges.
 PUBLISHED = {NOISY: (0.45, 0.53), ROBUST: (0.59, 0.66)}
 _MEMORY = {
     0.0: "Networks alone carried on, as in the dissertation",
@@ -65,19 +69,20 @@ def noise_curves(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     panels[0].set_ylim(np.floor(least * 20) / 20, 1.005)
     panels[0].set_ylabel("learned behaviour accuracy\n(share of states)", color=theme.ink, fontsize=TEXT)
     shown = {label: h for p in panels for h, label in zip(*p.get_legend_handles_labels(), strict=True)}
-    title = f"Patrol, {level:.0%} of forward moves and right turns misreported"
+    title = f"Patrol, {level:.0%} of forward moves and right turns observed wrongly"
     head(figure, theme, list(shown.values()), title=title)
-    runs = max(len(r["accuracy"]) for r in results["noise"].values() if "accuracy" in r)
+    replications = max(len(r["accuracy"]) for r in results["noise"].values() if "accuracy" in r)
     foot(
         figure,
         theme,
-        f"line: mean of {counted(runs, 'run')}; band: its 95% interval; the axis does not begin at zero",
+        f"line: mean of {counted(replications, 'replication')}; band: its 95% interval; "
+        "the axis does not begin at zero",
     )
     return figure
 
 
 def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
-    """What noise costs: LBA of the last sessions by its level, and breaches that succeed at one level.
+    """Draw the cost of noise: LBA of the last sessions by its level, and successful breaches at one level.
 
     Grey bars are the dissertation's ranges of success.
     """
@@ -99,7 +104,12 @@ def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
         if clean is not None:
             label = _with_memory(CLEAN, forgetting)
             left.axhline(_last(clean).mean(), color=theme.ink, linewidth=1.2, linestyle=dash, label=label)
-    dress(left, theme, title=f"Accuracy, mean of the last {LAST} sessions", x="probability of a misreport")
+    dress(
+        left,
+        theme,
+        title=f"Accuracy, mean of the last {LAST} sessions",
+        x="probability of a wrong observation",
+    )
     left.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     left.set_xticks(levels)
     # One level alone is one place, however many methods stand side by side there.
@@ -109,12 +119,14 @@ def noise_levels(results: Results, theme: Theme, level: float = 0.05) -> Figure:
     for axis in (left.yaxis, right.xaxis):
         axis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     handles = left.get_legend_handles_labels()[0]
-    head(figure, theme, handles, title="What misreports cost on patrol", columns=2)
+    head(figure, theme, handles, title="Cost of wrong observations on patrol", columns=2)
     foot(
-        figure, theme,
-        "point: mean over runs; bar: its 95% interval; grey: range in the dissertation; the left axis does "
+        figure,
+        theme,
+        "point: mean over replications; bar: its 95% interval; grey: range in the dissertation; "
+        "the left axis does "
         "not begin at zero",
-    )  # fmt: skip
+    )
     return figure
 
 
@@ -133,7 +145,11 @@ def _breaches(axes: Axes, results: Results, theme: Theme, level: float) -> None:
         axes.hlines(y, mean - half, min(mean + half, 1.0), color=theme.series[0], linewidth=2.2, alpha=0.65)
         axes.plot(mean, y, linestyle="", marker="o", markersize=7, color=theme.series[0])
     dress(
-        axes, theme, title=f"Breaches that succeed, {level:.0%} misreports", x="share of breaches", grid="x"
+        axes,
+        theme,
+        title=f"Breaches that succeed, {level:.0%} wrong observations",
+        x="share of breaches",
+        grid="x",
     )
     axes.set_yticks(range(len(named)), [label for label, _ in named], fontsize=SMALL)
     axes.set_ylim(len(named) - 0.4, -0.6)
@@ -185,9 +201,11 @@ def view_curves(results: Results, theme: Theme, gail_memory: float = 0.0) -> Fig
     panels[0, 0].set_ylabel("learned behaviour accuracy\n(share of states)", color=theme.ink, fontsize=TEXT)
     panels[1, 0].set_ylabel("accuracy lost against a full view\n(share)", color=theme.ink, fontsize=TEXT)
     head(
-        figure, theme, panels[0, 0].get_legend_handles_labels()[0],
+        figure,
+        theme,
+        panels[0, 0].get_legend_handles_labels()[0],
         title="Patrol through a keyhole: online GAIL beside LME-I2RL",
-    )  # fmt: skip
+    )
     foot(
         figure,
         theme,
@@ -197,7 +215,7 @@ def view_curves(results: Results, theme: Theme, gail_memory: float = 0.0) -> Fig
 
 
 def write_figures(results: Results, folder: Path | str) -> list[Path]:
-    """All figures whose results are there, in both themes."""
+    """Write all figures that have results, in both themes."""
     written: list[Path] = []
     if results.get("noise"):
         written += save_themes(lambda theme: noise_curves(results, theme), folder, "patrol-noise")
@@ -224,8 +242,10 @@ def _required(one: Mapping[str, Any] | None) -> Mapping[str, Any]:
     return one
 
 
-def _draw_mean(axes: Axes, style: Mapping[str, Any], name: str, x: np.ndarray, runs: np.ndarray) -> None:
-    mean, half = interval(runs)
+def _draw_mean(
+    axes: Axes, style: Mapping[str, Any], name: str, x: np.ndarray, replications: np.ndarray
+) -> None:
+    mean, half = interval(replications)
     top = np.minimum(mean + half, 1.0)
     axes.fill_between(x, mean - half, top, color=style["color"], alpha=0.18, linewidth=0)
     every = max(len(x) // 7, 1)

@@ -1,10 +1,10 @@
-"""What a study of adversarial learners comes to, as plain arrays, of which figures and tables are made.
+"""Results of a study of adversarial learners, as plain arrays for figures and tables.
 
-How to fill it: one :class:`AdversarialResults` a domain; one :class:`MethodResult` a method, under its name
-from :data:`METHODS`, with one row a seed and one column a session. Seed ``i`` is the same for all methods.
-What a domain has no use for stays None or empty, and its figures and tables are left out. Everything can be
-stored and read again (:func:`store_results`, :func:`load_results`), so that a study may run on one machine
-and be told on another.
+Results have one :class:`AdversarialResults` a domain; one :class:`MethodResult` a method, under its name from
+:data:`METHODS`, with one row a replication and one column a session. Replication ``i`` has the same seed for
+all methods. Fields without use in a domain stay None or empty, and their figures and tables are left out.
+Results can be stored and loaded (:func:`store_results`, :func:`load_results`), so that a study may run on one
+machine and its page be written on another.
 """
 
 from __future__ import annotations
@@ -40,39 +40,43 @@ LEARNED = "robust-AIRL, sensor learned"
 METHODS = (CLEAN, NOISY, ROBUST, SSRR, LEARNED)
 
 DOMAINS = {
-    "patrol": "Patrol", "mountain-car": "Mountain car", "hopper": "Hopper", "walker2d": "Walker2d",
-    "half-cheetah": "HalfCheetah", "onion": "Onion sorting, continuous",
-}  # fmt: skip
+    "patrol": "Patrol",
+    "mountain-car": "Mountain car",
+    "hopper": "Hopper",
+    "walker2d": "Walker2d",
+    "half-cheetah": "HalfCheetah",
+    "onion": "Onion sorting, continuous",
+}
 """Names on the command line, and on the page."""
 
 _DRAWN_STEPS = 1500
 
 
 class MethodResult(NamedTuple):
-    """One method on all seeds.
+    """One method on all replications.
 
     Fields
     ------
     pairs : int ``[T]``
         Reported state-action pairs seen after each session.
-    accuracy : float ``[seeds, T]`` or None
+    accuracy : float ``[replications, T]`` or None
         LBA in [0, 1], over the states that :attr:`AdversarialResults.accuracy_over` says.
-    returns : float ``[seeds, T]`` or None
+    returns : float ``[replications, T]`` or None
         Mean true return of the learned policy after each session.
     correlations : RewardCorrelation a seed, after the last session; or none
     errors : EmpiricalILE a seed, after the last session; or none
-    breaches : float ``[seeds]`` or None
+    breaches : float ``[replications]`` or None
         Share of breaches of the patrol that succeed with what was learned in the end.
     seconds : float or None
         Median of a session, once compiled.
     """
 
     pairs: Int[np.ndarray, " T"]
-    accuracy: Float[np.ndarray, "seeds T"] | None = None
-    returns: Float[np.ndarray, "seeds T"] | None = None
+    accuracy: Float[np.ndarray, "replications T"] | None = None
+    returns: Float[np.ndarray, "replications T"] | None = None
     correlations: tuple[RewardCorrelation, ...] = ()
     errors: tuple[EmpiricalILE, ...] = ()
-    breaches: Float[np.ndarray, " seeds"] | None = None
+    breaches: Float[np.ndarray, " replications"] | None = None
     seconds: float | None = None
 
     @property
@@ -99,18 +103,18 @@ class RewardScatter(NamedTuple):
 
 
 class Belief(NamedTuple):
-    """A noisy trajectory and what is believed of it; see :func:`belief_from_draws`.
+    """Noisy trajectory and its posterior; see :func:`belief_from_draws`.
 
     Fields
     ------
     names : str a component, with its unit
-    reported, truth : float ``[L, m]``
+    observed, truth : float ``[L, m]``
     mean, low, high : float ``[L, m]``, of the posterior; the ends of its middle ``coverage``
     coverage : float
     """
 
     names: tuple[str, ...]
-    reported: Float[np.ndarray, "L m"]
+    observed: Float[np.ndarray, "L m"]
     truth: Float[np.ndarray, "L m"]
     mean: Float[np.ndarray, "L m"]
     low: Float[np.ndarray, "L m"]
@@ -142,7 +146,7 @@ class AdversarialResults(NamedTuple):
     ------
     domain : one of :data:`DOMAINS`
     noise : str, the sensor in words ("normal, covariance 0.05 I")
-    seeds : int
+    replications : int
     machine : str, where seconds were measured
     methods : mapping from a name of :data:`METHODS` to MethodResult
     accuracy_over : str, the states of LBA in words
@@ -150,7 +154,8 @@ class AdversarialResults(NamedTuple):
     scatters : mapping from a method's name to RewardScatter, of one seed
     belief : Belief or None
     frames : FrameStrip a row
-    cells : mapping from a method's name to LBA in each cell ``[cells, cells]`` of mountain car, mean of seeds
+    cells : mapping from a method's name to LBA in each cell ``[cells, cells]`` of mountain car, mean of
+    replications
     settings : mapping from words to plain values, for the file
     expert_breaches : float or None
         Share of breaches of the patrol that succeed with the expert's own policy.
@@ -158,7 +163,7 @@ class AdversarialResults(NamedTuple):
 
     domain: str
     noise: str
-    seeds: int
+    replications: int
     machine: str
     methods: Mapping[str, MethodResult]
     accuracy_over: str = "all states"
@@ -177,21 +182,25 @@ class AdversarialResults(NamedTuple):
 
     @property
     def measure(self) -> str:
-        """What noise is said to cost: ``"accuracy"`` (LBA) of few actions, ``"returns"`` of vectors."""
+        """Measure of the cost of noise: ``"accuracy"`` (LBA) of few actions, ``"returns"`` of vectors."""
         return "accuracy" if self.domain in ("patrol", "mountain-car") else "returns"
 
-    def late(self, method: str, measure: str) -> Float[np.ndarray, " seeds"] | None:
-        """A method's measure averaged over the last quarter of its sessions, None where there is none."""
+    def late(self, method: str, measure: str) -> Float[np.ndarray, " replications"] | None:
+        """Average a method's measure over the last quarter of its sessions; None if it has none."""
         result = self.methods.get(method)
-        runs = None if result is None else getattr(result, measure)
-        return None if result is None or runs is None else np.asarray(runs)[:, result.late].mean(1)
+        replications = None if result is None else getattr(result, measure)
+        return (
+            None
+            if result is None or replications is None
+            else np.asarray(replications)[:, result.late].mean(1)
+        )
 
     def recovery(self, method: str = ROBUST) -> Recovery | None:
         """Share of what noise cost that a method recovers, None without all three methods."""
-        runs = [self.late(name, self.measure) for name in (CLEAN, NOISY, method)]
-        if any(x is None for x in runs):
+        replications = [self.late(name, self.measure) for name in (CLEAN, NOISY, method)]
+        if any(x is None for x in replications):
             return None
-        clean, noisy, robust = runs
+        clean, noisy, robust = replications
         return recovered_share(clean, noisy, robust, jax.random.key(0))  # type: ignore[arg-type]
 
 
@@ -217,22 +226,22 @@ def reward_scatter(
 
 def belief_from_draws(
     names: Sequence[str],
-    reported: Float[np.ndarray, "L m"],
+    observed: Float[np.ndarray, "L m"],
     truth: Float[np.ndarray, "L m"],
     draws: Float[np.ndarray, "M L m"],
     coverage: float = 0.9,
 ) -> Belief:
-    """What ``M`` posterior draws of one trajectory's components say. ``ValueError`` for unlike shapes."""
+    """Summarise ``M`` posterior draws of one trajectory's components. ``ValueError`` for unlike shapes."""
     shape = (len(truth), len(names))
-    if not np.shape(reported) == np.shape(truth) == np.shape(draws)[1:] == shape:
+    if not np.shape(observed) == np.shape(truth) == np.shape(draws)[1:] == shape:
         raise ValueError(
             f"{len(names)} components need arrays [L, {len(names)}] and draws [M, L, {len(names)}], got "
-            f"{np.shape(reported)}, {np.shape(truth)} and {np.shape(draws)}"
+            f"{np.shape(observed)}, {np.shape(truth)} and {np.shape(draws)}"
         )
     tail = (1 - coverage) / 2
     low, high = np.quantile(draws, [tail, 1 - tail], axis=0)
     return Belief(
-        tuple(names), np.asarray(reported), np.asarray(truth), np.mean(draws, 0), low, high, coverage
+        tuple(names), np.asarray(observed), np.asarray(truth), np.mean(draws, 0), low, high, coverage
     )
 
 
@@ -260,10 +269,17 @@ def frame_strip(
 _KINDS = {
     kind.__name__: kind
     for kind in (
-        AdversarialResults, MethodResult, RewardScatter, Belief, FrameStrip, Correlation, EmpiricalILE,
-        Interval, RewardCorrelation,
+        AdversarialResults,
+        MethodResult,
+        RewardScatter,
+        Belief,
+        FrameStrip,
+        Correlation,
+        EmpiricalILE,
+        Interval,
+        RewardCorrelation,
     )
-}  # fmt: skip
+}
 
 
 def store_results(results: AdversarialResults, path: Path | str) -> None:
@@ -288,7 +304,7 @@ def read_plain(path: Path | str) -> Any:
 
 
 def plain(value: Any) -> Any:
-    """As JSON, which has no arrays, named tuples, or numbers that are not finite."""
+    """Convert to JSON, which has no arrays, named tuples, or numbers that are not finite."""
     if type(value).__name__ in _KINDS:
         return {"kind": type(value).__name__, **{k: plain(v) for k, v in value._asdict().items()}}
     if isinstance(value, Mapping):
@@ -306,7 +322,7 @@ def plain(value: Any) -> Any:
 
 
 def rebuilt(value: Any) -> Any:
-    """What :func:`plain` was given; lists come back as tuples, all arrays as NumPy's."""
+    """Invert :func:`plain`; lists come back as tuples, all arrays as NumPy's."""
     if isinstance(value, list):
         return tuple(rebuilt(x) for x in value)
     if not isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""What ``i2rl run robust-airl`` does: the study of one task at one level of noise, and its report."""
+"""Study of one task at one level of noise, and its page: the command ``i2rl run robust-airl``."""
 
 from __future__ import annotations
 
@@ -17,23 +17,24 @@ __all__ = ["answer", "print_tables", "summary", "write"]
 
 def answer(
     domain: str,
-    seeds: int = 1,
+    replications: int = 1,
     sessions: int | None = None,
     noise: float = 1.0,
     *,
     workers: int = 1,
-    kept: Path | None = None,
+    cache: Path | None = None,
     advance: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> AdversarialResults:
-    """The study of a task with ``noise`` times its own noise. Raises ``ValueError`` for noise of zero, and
-    for a domain that is not studied.
+    """Study a task with ``noise`` times its own noise.
+
+    Raises ``ValueError`` for noise of zero, and for a domain that is not studied.
     """
     if not noise > 0:
         raise ValueError(f"noise is a multiple, above zero, of the study's own; got {noise}")
     if domain == "patrol":
         from .patrol import patrol_results
 
-        results = patrol_results(seeds, sessions, noise, advance=advance)
+        results = patrol_results(replications, sessions, noise, advance=advance)
         return results._replace(machine=_machine())
     if domain not in PLANS:
         raise ValueError(f"the domain is one of patrol, {', '.join(PLANS)}; got {domain!r}")
@@ -41,12 +42,12 @@ def answer(
     if sessions is not None:
         plan = plan._replace(sessions=sessions)
     return adversarial_study.adversarial_study(
-        domain, seeds, plan, workers=workers, folder=kept, machine=_machine(), advance=advance
+        domain, replications, plan, workers=workers, folder=cache, machine=_machine(), advance=advance
     )
 
 
 def write(results: AdversarialResults, folder: Path | str) -> Path:
-    """Write the report of one task; of patrol, what one learner believes of a trajectory besides."""
+    """Write the page of one task; patrol's also shows one learner's posterior of a trajectory."""
     if results.domain != "patrol":
         return write_study(results, folder)
     from .patrol import believed_trajectories

@@ -1,10 +1,10 @@
-"""The study of adversarial learners under noisy perception: Tables 7.3 and 7.4, Figures 7.12 and 7.13.
+"""Study of adversarial learners under noisy perception: Tables 7.3 and 7.4, Figures 7.12 and 7.13.
 
-For each seed and method one online learner: in every session it is given one new demonstration and trains
-for the same number of environment steps. Methods differ in what they are given (the truth or reports) and in
-what they make of it. Every session is judged by what learning never sees: the true reward and the expert.
+Each replication and method has one online learner: every session it is given one new demonstration and trains
+for the same number of environment steps. Methods differ in their input (the truth or observations) and in
+their learner. The true reward and the expert, hidden from learning, judge every session.
 
-Runs are independent, so they may be shared out over processes and kept on disk one by one.
+Runs are independent, so processes may share them and store them on disk one by one.
 """
 
 from __future__ import annotations
@@ -60,11 +60,11 @@ STUDIED = (CLEAN, NOISY, ROBUST, LEARNED, SSRR)
 
 
 class Outcome(NamedTuple):
-    """One run.
+    """Result of one replication of a method.
 
     Fields
     ------
-    pairs, steps : int ``[T]``, reported pairs and environment steps after each session
+    pairs, steps : int ``[T]``, observed pairs and environment steps after each session
     returns, accuracy : float ``[T]``
     seconds : float ``[T]``
     scatter : RewardScatter
@@ -90,7 +90,7 @@ class Outcome(NamedTuple):
 
 @lru_cache(maxsize=8)
 def learner(name: str, method: str, plan: Plan) -> Learner:
-    """The learner of a task by a method; compiled once a process. ``ValueError`` for another method."""
+    """Make the learner of a task by a method; compiled once a process. ``ValueError`` for another method."""
     if method not in STUDIED:
         raise ValueError(f"the method is one of {'; '.join(STUDIED)}; got {method!r}")
     of = case(name, plan)
@@ -138,7 +138,7 @@ _REGRESSION = Regression(
 
 
 def _gathered(method: str, plan: Plan) -> int:
-    """How many sessions' demonstrations are learned from at once: SSRR's ranking needs a long session."""
+    """Return the number of sessions that are learned from at once: SSRR's ranking needs a long session."""
     halved = method == SSRR and plan.sessions % _SSRR_SESSIONS == 0
     return plan.sessions // _SSRR_SESSIONS if halved else 1
 
@@ -154,8 +154,8 @@ def run(name: str, method: str, seed: int, plan: Plan) -> Outcome:
     gathered = _gathered(method, plan)
     for session in range(plan.sessions // gathered):
         truth = _session(of.demonstrations, session, seed, gathered * plan.trajectories)
-        reported = distort(jax.random.fold_in(k_noise, session), of.sensor, truth)
-        given: Any = truth if method == CLEAN else reported
+        observed = distort(jax.random.fold_in(k_noise, session), of.sensor, truth)
+        given: Any = truth if method == CLEAN else observed
         report: Any
         state, report = online.update(state, given)
         policy = state.generator.policy
@@ -177,7 +177,7 @@ def run(name: str, method: str, seed: int, plan: Plan) -> Outcome:
         _error(of, state.network, policy, k_judge),
         np.array(sensors) if sensors else np.zeros((0, 0)),
         simulate(of.level, policy, k_judge, 1, 200, deterministic=True).observations[0],
-        _belief(of, policy, truth, reported) if method == ROBUST else None,
+        _belief(of, policy, truth, observed) if method == ROBUST else None,
         of.cells(policy) if of.cells else np.zeros((0, 0)),
     )
 
@@ -188,7 +188,7 @@ def _sensor_numbers(sensor: Any) -> Float[np.ndarray, " p"]:
 
 
 def _session(whole: Recording, session: int, seed: int, trajectories: int) -> Recording:
-    """A session's demonstrations: the next of those there are, other ones first for another seed."""
+    """Return a session's demonstrations: the next ones in order, from another place for another seed."""
     total = whole.live.shape[0]
     order = np.random.default_rng(seed).permutation(total)
     places = (session * trajectories + np.arange(trajectories)) % total
@@ -225,17 +225,17 @@ def _error(of: Case, network: Any, policy: Any, key: Array) -> EmpiricalILE:
     )
 
 
-def _belief(of: Case, policy: Any, truth: Recording, reported: Recording) -> Belief:
-    """What the last policy makes of the beginning of the last demonstration."""
+def _belief(of: Case, policy: Any, truth: Recording, observed: Recording) -> Belief:
+    """Complete the beginning of the last demonstration under the last policy."""
     names, columns = of.components
-    steps = min(_SHOWN_STEPS, int(reported.lengths[0]))
+    steps = min(_SHOWN_STEPS, int(observed.lengths[0]))
 
     def first(recording: Recording) -> Recording:
         observations, actions, live = (x[:1, :steps] for x in recording[:3])
         return Recording(observations, actions, live, jnp.zeros(1, bool))
 
     hidden = Smoothed(of.truth(draws=64), of.sensor)
-    begun = hidden.begin(first(reported), of.sensor, jax.random.key(0))
+    begun = hidden.begin(first(observed), of.sensor, jax.random.key(0))
     _, drawn = hidden.refresh(begun, of.sensor, policy, jax.random.key(0))
     d = truth.observations.shape[-1]
 
@@ -247,7 +247,7 @@ def _belief(of: Case, policy: Any, truth: Recording, reported: Recording) -> Bel
 
     return belief_from_draws(
         names,
-        picked(first(reported).observations[0], first(reported).actions[0]),
+        picked(first(observed).observations[0], first(observed).actions[0]),
         picked(first(truth).observations[0], first(truth).actions[0]),
         np.moveaxis(picked(drawn.steps.observations, drawn.steps.actions), 1, 0),
     )
@@ -256,12 +256,12 @@ def _belief(of: Case, policy: Any, truth: Recording, reported: Recording) -> Bel
 _SHOWN_STEPS = 100
 
 
-# -- all seeds and methods ----------------------------------------------------------------------------
+# -- all replications and methods ----------------------------------------------------------------------------
 
 
 def adversarial_study(
     name: str,
-    seeds: int = 5,
+    replications: int = 5,
     plan: Plan | None = None,
     methods: Sequence[str] = STUDIED,
     *,
@@ -270,37 +270,39 @@ def adversarial_study(
     machine: str = "",
     advance: Callable[[str, float | None], None] = lambda text, share: None,
 ) -> AdversarialResults:
-    """All seeds of all methods on one task.
+    """Run all replications of all methods on one task.
 
-    Runs found in ``folder`` are not run again, and new ones are kept there. Raises ``ValueError`` for another
-    name than :data:`~i2rl.analysis.studies.adversarial.cases.PLANS` has, and for fewer than one seed or
-    session.
+    Finished runs in ``folder`` are loaded, and new ones are stored there. Raises ``ValueError`` for another
+    name than :data:`~i2rl.analysis.studies.adversarial.cases.PLANS` has, and for fewer than one replication
+    or session.
     """
-    if seeds < 1:
-        raise ValueError(f"there must be at least one seed, got {seeds}")
+    if replications < 1:
+        raise ValueError(f"replications must be at least 1; got {replications}")
     of = case(name, plan)
     if of.plan.sessions < 1:
         raise ValueError(f"there must be at least one session, got {of.plan.sessions}")
-    wanted = [(method, seed) for seed in range(seeds) for method in methods]
+    wanted = [(method, seed) for seed in range(replications) for method in methods]
     outcomes = {}
     for done, (which, outcome) in enumerate(_all_runs(name, wanted, of.plan, workers, folder)):
         outcomes[which] = outcome
         method, seed = which
         advance(f"{method}, seed {seed}: return {outcome.returns[-1]:.0f}", (done + 1) / len(wanted))
-    by_method = {m: [outcomes[m, seed] for seed in range(seeds)] for m in methods}
-    shown = {m: runs[0] for m, runs in by_method.items()}
+    by_method = {m: [outcomes[m, seed] for seed in range(replications)] for m in methods}
+    shown = {m: repeats[0] for m, repeats in by_method.items()}
     return AdversarialResults(
         name,
         of.noise,
-        seeds,
+        replications,
         machine,
-        {m: _result(runs) for m, runs in by_method.items()},
+        {m: _result(repeats) for m, repeats in by_method.items()},
         accuracy_over=of.accuracy_over,
         expert_return=of.expert_return,
         scatters={m: outcome.scatter for m, outcome in shown.items()},
         belief=shown[ROBUST].belief if ROBUST in shown else None,
         frames=_frames(name, shown),
-        cells={m: np.mean([r.cells for r in runs], 0) for m, runs in by_method.items()} if of.cells else {},
+        cells={m: np.mean([r.cells for r in repeats], 0) for m, repeats in by_method.items()}
+        if of.cells
+        else {},
         settings=_settings(of.plan, by_method),
     )
 
@@ -313,23 +315,23 @@ def _frames(name: str, shown: Mapping[str, Outcome]) -> tuple[FrameStrip, ...]:
     return (expert, *(frame_strip(m, robot, outcome.episode) for m, outcome in shown.items()))
 
 
-def _settings(plan: Plan, runs: Mapping[str, Sequence[Outcome]]) -> dict[str, Any]:
+def _settings(plan: Plan, repeats: Mapping[str, Sequence[Outcome]]) -> dict[str, Any]:
     """For the file: the plan, the budget of each method, and what was learned of the sensor."""
     told = {**{k: v for k, v in plan._asdict().items() if k != "settings"}, **dict(plan.settings)}
-    told["environment steps"] = {m: int(outcomes[0].steps[-1]) for m, outcomes in runs.items()}
-    if LEARNED in runs:
-        told["learned sensor, a row a seed"] = [o.sensor[-1].tolist() for o in runs[LEARNED]]
+    told["environment steps"] = {m: int(outcomes[0].steps[-1]) for m, outcomes in repeats.items()}
+    if LEARNED in repeats:
+        told["learned sensor, a row a replication"] = [o.sensor[-1].tolist() for o in repeats[LEARNED]]
     return told
 
 
-def _result(runs: Sequence[Outcome]) -> MethodResult:
+def _result(repeats: Sequence[Outcome]) -> MethodResult:
     return MethodResult(
-        runs[0].pairs,
-        np.array([r.accuracy for r in runs]),
-        np.array([r.returns for r in runs]),
-        tuple(r.scatter.correlation for r in runs),
-        tuple(r.error for r in runs),
-        seconds=float(np.median([r.seconds[1:] for r in runs])) if len(runs[0].seconds) > 1 else None,
+        repeats[0].pairs,
+        np.array([r.accuracy for r in repeats]),
+        np.array([r.returns for r in repeats]),
+        tuple(r.scatter.correlation for r in repeats),
+        tuple(r.error for r in repeats),
+        seconds=float(np.median([r.seconds[1:] for r in repeats])) if len(repeats[0].seconds) > 1 else None,
     )
 
 
@@ -347,14 +349,16 @@ def _all_runs(
 
 
 def _kept(name: str, method: str, seed: int, plan: Plan, folder: Path | None) -> Outcome:
-    """A run, from disk where it was kept."""
+    """Load a finished replication from disk."""
     if folder is None:
         return run(name, method, seed, plan)
     path = Path(folder) / name / f"{plan.digest}-{method.replace(' ', '_').replace(',', '')}-{seed}.json"
     if path.exists():
         fields = read_plain(path)
         if not isinstance(fields, dict) or fields.keys() != set(Outcome._fields):
-            raise StorageError(f"{path}: the file does not hold a finished run; delete it to run again")
+            raise StorageError(
+                f"{path}: the file must hold a finished replication; delete it to run it again"
+            )
         return Outcome(**fields)
     outcome = run(name, method, seed, plan)
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -32,7 +32,7 @@ _PATHS = 5
 
 
 def draw_world(study: LabelBiasStudy, theme: Theme) -> Figure:
-    """The median world with the ways of some trajectories, from the least reward to the most."""
+    """Draw the median world with the paths of some trajectories, from the least reward to the most."""
     world = study.world
     rows, columns = world.walls.shape
     figure = new_figure(theme, 6.4, 5.2)
@@ -49,12 +49,12 @@ def draw_world(study: LabelBiasStudy, theme: Theme) -> Figure:
     ]
     cells = np.array(world.cells)
     ranked = np.argsort(np.asarray(study.trajectories.reward), kind="stable")
-    # Evenly between the first and the last of those that differ: most of them earn nothing.
+    # Evenly between the first and the last of those that differ: most of them earn zero.
     _, distinct = np.unique(np.asarray(study.trajectories.reward)[ranked], return_index=True)
     chosen = ranked[distinct[np.unique(np.linspace(0, len(distinct) - 1, _PATHS).round().astype(int))]]
     for i, path in enumerate(chosen):
         states = np.asarray(study.trajectories.states[path])
-        # Side by side, so that ways through one cell stay apart.
+        # Side by side, so that paths through one cell stay apart.
         offset = (i - (_PATHS - 1) / 2) * 0.12
         style = series_style(theme, i)
         r, c = cells[states].T
@@ -62,9 +62,15 @@ def draw_world(study: LabelBiasStudy, theme: Theme) -> Figure:
         axes.plot(c[0] + offset, r[0] + offset, color=style["color"], marker=style["marker"], markersize=6)
         reward = float(study.trajectories.reward[path])
         handles.append(
-            Line2D([], [], color=style["color"], linestyle=style["linestyle"], marker=style["marker"],
-                   label=f"earns {number(reward)}, BIRL {float(study.trajectories.birl[path]):.1f} nats")
-        )  # fmt: skip
+            Line2D(
+                [],
+                [],
+                color=style["color"],
+                linestyle=style["linestyle"],
+                marker=style["marker"],
+                label=f"earns {number(reward)}, BIRL {float(study.trajectories.birl[path]):.1f} nats",
+            )
+        )
     dress(axes, theme, x="column (cells)", y="row (cells)", grid=None)
     axes.set(xlim=(-0.5, columns - 0.5), ylim=(rows - 0.5, -0.5), aspect="equal")
     axes.set_xticks(range(columns))
@@ -93,9 +99,14 @@ def draw_scatter(study: LabelBiasStudy, theme: Theme) -> Figure:
     ):
         style = method_styles(theme, [name])[name]
         axes.plot(
-            reward + (spread if name == "BIRL" else 0), np.asarray(likelihood), linestyle="", markersize=5,
-            marker=style["marker"], color=style["color"], alpha=0.6,
-        )  # fmt: skip
+            reward + (spread if name == "BIRL" else 0),
+            np.asarray(likelihood),
+            linestyle="",
+            markersize=5,
+            marker=style["marker"],
+            color=style["color"],
+            alpha=0.6,
+        )
         p = tell_p(found.p)
         title = (
             f"{name}: no correlation, one of the two is constant"
@@ -113,7 +124,7 @@ def draw_scatter(study: LabelBiasStudy, theme: Theme) -> Figure:
 
 
 def _critical(n: int) -> float:
-    """The correlation of ``n`` pairs that is just significant at 0.05."""
+    """Compute the correlation of ``n`` pairs that is just significant at 0.05."""
     from scipy.stats import t
 
     quantile = t.ppf(0.975, n - 2)
@@ -121,7 +132,7 @@ def _critical(n: int) -> float:
 
 
 def draw_settings(study: LabelBiasStudy, theme: Theme) -> Figure:
-    """Every world's correlation, one row a setting."""
+    """Draw every world's correlation, one row a setting."""
     from .study import PRINTED_RHO
 
     figure = new_figure(theme, 9.0, 1.6 + 0.42 * len(study.results))
@@ -160,15 +171,31 @@ def draw_settings(study: LabelBiasStudy, theme: Theme) -> Figure:
     name_ticks(axes, "y", range(len(study.results)), [r.setting.name for r in study.results], fontsize=SMALL)
     axes.set(ylim=(len(study.results) - 0.5, -0.5), xlim=(-1.05, 1.05))
     handles = [
-        Line2D([], [], linestyle="", marker=birl["marker"], markersize=4, color=birl["color"],
-               label="BIRL, a world"),
-        Line2D([], [], linestyle="", marker="|", markersize=12, markeredgewidth=2.4, color=theme.ink,
-               label="BIRL, median"),
-        Line2D([], [], linestyle="", marker=maxent["marker"], color=maxent["color"],
-               label="MaxEnt, all worlds"),
+        Line2D(
+            [],
+            [],
+            linestyle="",
+            marker=birl["marker"],
+            markersize=4,
+            color=birl["color"],
+            label="BIRL, a world",
+        ),
+        Line2D(
+            [],
+            [],
+            linestyle="",
+            marker="|",
+            markersize=12,
+            markeredgewidth=2.4,
+            color=theme.ink,
+            label="BIRL, median",
+        ),
+        Line2D(
+            [], [], linestyle="", marker=maxent["marker"], color=maxent["color"], label="MaxEnt, all worlds"
+        ),
         band,
         printed,
-    ]  # fmt: skip
+    ]
     head(figure, theme, handles, title="What the correlation depends on", columns=3)
     return figure
 

@@ -1,4 +1,4 @@
-"""The report on label bias: Table 5.1 beside the dissertation's, and where the correlation is significant."""
+"""Page on label bias: Table 5.1 beside the dissertation's, and its significance by setting."""
 
 from __future__ import annotations
 
@@ -35,22 +35,24 @@ def _rows(study: LabelBiasStudy) -> list[dict[str, Any]]:
     for result in study.results:
         low, median, high = quantiles(result.birl)
         deviations = np.abs(1 - result.maxent[np.isfinite(result.maxent)])
-        rows.append({
-            "setting": result.setting.name,
-            "worlds with a correlation": int(np.isfinite(result.birl).sum()),
-            "BIRL median rho": median,
-            "BIRL rho, 5 % and 95 % of worlds": [low, high],
-            "share significant": result.significant.value,
-            "share significant, 95 % interval": list(result.significant[1:]),
-            "share significantly negative": result.negative.value,
-            "median rho of choices met": quantiles(result.choice)[1],
-            "MaxEnt largest |1 - rho|": float(np.max(deviations, initial=0.0)),
-        })  # fmt: skip
+        rows.append(
+            {
+                "setting": result.setting.name,
+                "worlds with a correlation": int(np.isfinite(result.birl).sum()),
+                "BIRL median rho": median,
+                "BIRL rho, 5 % and 95 % of worlds": [low, high],
+                "share significant": result.significant.value,
+                "share significant, 95 % interval": list(result.significant[1:]),
+                "share significantly negative": result.negative.value,
+                "median rho of choices met": quantiles(result.choice)[1],
+                "MaxEnt largest |1 - rho|": float(np.max(deviations, initial=0.0)),
+            }
+        )
     return rows
 
 
 def summary(study: LabelBiasStudy) -> dict[str, Any]:
-    """Settings and results as plain data; None where no world has a correlation."""
+    """Return settings and results as plain data; None if no world has a correlation."""
     told: dict[str, Any] = plain({"provenance": study_provenance(study.seed), **_summary(study)})
     return told
 
@@ -161,25 +163,25 @@ def _text(study: LabelBiasStudy) -> str:
     first = study.results[0]
     return f"""A world of 10 x 10 cells with {counted(study.walls, "wall")}, a desirable object in each of \
 two corners, deterministic moves. The law of maximum entropy makes a trajectory's log-likelihood its reward \
-less a constant, so the two correlate perfectly, whoever demonstrates.
+less a constant, so the two correlate perfectly for every expert.
 
-Bayesian IRL normalises over actions in every state. Its log-likelihood is the sum of advantages times eta, \
-which grows with the reward, less what the choices met on the way cost, and at an object in a corner there \
-are most equally good choices: moving against either edge is one more way of staying. The two pull in \
-opposite directions, and what comes out depends on how sharply experts choose.
+Bayesian IRL normalises over actions in every state. Its log-likelihood is the sum of advantages times \
+the rationality, which grows with the reward, less the cost of the choices on the path, and at an object \
+in a corner there are most equally good choices: a move against either edge stays, too. The two pull in \
+opposite directions, and the result depends on the experts' rationality.
 
-With exp(Q) as the dissertation writes it (eta 1), a discount of {DISCOUNT:g}, {first.setting.steps} steps \
-and experts that follow that law, the correlation is significant at 0.05 in \
+With exp(Q) as the dissertation writes it (rationality 1), a discount of {DISCOUNT:g}, \
+{first.setting.steps} steps and experts that follow that law, the correlation is significant at 0.05 in \
 {_share(first.significant.value)} of the worlds; chance alone would give 5 %.
 
 {_conditions(study)}
 
-The dissertation does not say which of these it used, so its number is one point of the curve below and \
-not a property of the method. That the correlation can be anything is."""
+The dissertation does not state its setting, so its number is one point of the curve below and \
+not a property of the method. The property of the method is that the correlation can take any value."""
 
 
 def _conditions(study: LabelBiasStudy) -> str:
-    """Where BIRL's correlation is and is not significant in more than half of the worlds, in words."""
+    """Write when BIRL's correlation is and is not significant in more than half of the worlds."""
     told = []
     for title, results, name in (
         ("Of the settings, the correlation is", study.results, lambda r: r.setting.name),
@@ -219,7 +221,7 @@ def _lead(study: LabelBiasStudy) -> Lead:
         f"In {counted(study.worlds, 'world')} of known reward, the log-likelihood of MaxEnt correlates "
         "perfectly with the reward that a trajectory earns, and that of BIRL "
         + (
-            "with nothing, since all trajectories earn the same."
+            "with zero spread, since all trajectories earn the same."
             if np.isnan(median)
             else f"with rho {median:+.2f} (90 % of worlds: {low:+.2f} to {high:+.2f}) in the first setting."
         )
@@ -243,19 +245,31 @@ def write(study: LabelBiasStudy, folder: Path | str) -> Path:
     pictures = [
         drawn(folder, name, partial(draw, study), caption, description)
         for name, draw, caption, description in (
-            ("world", figures.draw_world,
-             "The median world: walls, the two objects, and trajectories from the least reward to the most.",
-             "Grid with walls, two objects in opposite corners, and five paths"),
-            ("scatter", figures.draw_scatter,
-             "Log-likelihood against total reward of the median world's trajectories.",
-             "Two scatter plots: no clear relation for BIRL, a straight line for MaxEnt"),
-            ("settings", figures.draw_settings,
-             "Correlation in every world, setting by setting, and the dissertation's one.",
-             "Correlations of BIRL from minus one to one depending on the setting; of MaxEnt always one"),
-            ("sweep", figures.draw_sweep,
-             "Correlation against how sharply experts choose (and are believed to choose).",
-             "BIRL's correlation falls from positive to minus one with eta where blocked moves stay"),
+            (
+                "world",
+                figures.draw_world,
+                "Median world: walls, the two objects, and trajectories from the least reward to the most.",
+                "Grid with walls, two objects in opposite corners, and five paths",
+            ),
+            (
+                "scatter",
+                figures.draw_scatter,
+                "Log-likelihood against total reward of the median world's trajectories.",
+                "Two scatter plots: no clear relation for BIRL, a straight line for MaxEnt",
+            ),
+            (
+                "settings",
+                figures.draw_settings,
+                "Correlation in every world, setting by setting, and the dissertation's one.",
+                "Correlations of BIRL from minus one to one depending on the setting; of MaxEnt always one",
+            ),
+            (
+                "sweep",
+                figures.draw_sweep,
+                "Correlation against how sharply experts choose (and are believed to choose).",
+                "BIRL's correlation falls from positive to minus one with eta where blocked moves stay",
+            ),
         )
-    ]  # fmt: skip
+    ]
     section = Section("What the correlation depends on", _text(study), _tables(study)[1:], pictures)
     return write_page(folder, "Label bias (Table 5.1)", _lead(study), [section], summary(study))

@@ -186,9 +186,15 @@ def label_bias_study(
     for i, setting in enumerate(settings):
         advance(setting.name, i / stages)
         walked = _in_every_world(
-            keys, stacked[setting.blocked], weights, setting.rationality, setting.discount,
-            _expert_code(setting.expert), steps=setting.steps, n=trajectories,
-        )  # fmt: skip
+            keys,
+            stacked[setting.blocked],
+            weights,
+            setting.rationality,
+            setting.discount,
+            _expert_code(setting.expert),
+            steps=setting.steps,
+            n=trajectories,
+        )
         first = walked if first is None else first
         results.append(_result(setting, walked))
     sweep = {}
@@ -212,11 +218,18 @@ def label_bias_study(
     of_world: Trajectories = jax.tree.map(lambda x: x[shown], first)
     advance("done", 1.0)
     return LabelBiasStudy(
-        worlds, trajectories, walls, seed, tuple(results), tuple(rationalities), sweep,
-        drawn[shown] if settings[0].blocked else without_blocked_moves(drawn[shown]), of_world,
+        worlds,
+        trajectories,
+        walls,
+        seed,
+        tuple(results),
+        tuple(rationalities),
+        sweep,
+        drawn[shown] if settings[0].blocked else without_blocked_moves(drawn[shown]),
+        of_world,
         correlation(np.asarray(of_world.birl), np.asarray(of_world.reward)),
         correlation(np.asarray(of_world.maxent), np.asarray(of_world.reward)),
-    )  # fmt: skip
+    )
 
 
 def correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> Correlation:
@@ -231,7 +244,7 @@ def correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> Corre
 
 
 def _spread(x: np.ndarray) -> float:
-    """Standard deviation; zero where it is no more than rounding."""
+    """Compute the standard deviation; zero if it is no more than rounding."""
     spread = float(np.std(x))
     return spread if spread > 1e-12 * (1 + float(np.abs(x).max())) else 0.0
 
@@ -246,16 +259,22 @@ def _result(setting: Setting, walked: Trajectories) -> SettingResult:
     for i in range(len(walked.reward)):
         reward = np.asarray(walked.reward[i])
         scores = [np.asarray(score[i]) for score in (walked.birl, walked.maxent, walked.choice)]
-        rows.append([
-            correlation(x, reward) if min(_spread(x), _spread(reward)) > 0
-            else Correlation(np.nan, np.nan, np.nan, np.nan, len(reward))
-            for x in scores
-        ])  # fmt: skip
+        rows.append(
+            [
+                correlation(x, reward)
+                if min(_spread(x), _spread(reward)) > 0
+                else Correlation(np.nan, np.nan, np.nan, np.nan, len(reward))
+                for x in scores
+            ]
+        )
     birl, maxent, choice = zip(*rows, strict=True)
     return SettingResult(
-        setting, np.array([c.rho for c in birl]), np.array([c.p for c in birl]),
-        np.array([c.rho for c in maxent]), np.array([c.rho for c in choice]),
-    )  # fmt: skip
+        setting,
+        np.array([c.rho for c in birl]),
+        np.array([c.p for c in birl]),
+        np.array([c.rho for c in maxent]),
+        np.array([c.rho for c in choice]),
+    )
 
 
 def _median_world(rho: Float[np.ndarray, " worlds"]) -> int:
@@ -369,7 +388,7 @@ def _walk(
 
 
 def quantiles(rho: Float[np.ndarray, " worlds"]) -> tuple[float, float, float]:
-    """The 5 %, 50 % and 95 % quantiles over the worlds with a correlation; NaN if there is none."""
+    """Compute the 5 %, 50 % and 95 % quantiles over the worlds with a correlation; NaN if there is none."""
     known = rho[np.isfinite(rho)]
     low, median, high = np.quantile(known, (0.05, 0.5, 0.95)) if len(known) else [np.nan] * 3
     return float(low), float(median), float(high)

@@ -45,7 +45,7 @@ _CORRIDOR, _WALL = 1.44, 0.28
 
 
 def bits_by_bout(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
-    """Running bits per decision against bouts, a panel for each view; every line named at its end."""
+    """Draw running bits per decision against bouts, a panel for each view; every line named at its end."""
     figure = new_figure(theme, 6.2 * len(result.views), 4.6)
     panels = figure.subplots(1, len(result.views), squeeze=False, sharey=True)[0]
     bouts = np.arange(1, len(result.decisions) + 1)
@@ -66,21 +66,31 @@ def bits_by_bout(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
         ends = np.array([p.bits.sum() / seen[-1] for p in order])
         for p, end, y in zip(order, ends, _spread(ends, 0.052 * (high - low)), strict=True):
             axes.annotate(
-                for_figure(f"{p.method}  {end:.3f}"), (bouts[-1], end), (1.04, y),
-                textcoords=("axes fraction", "data"), va="center", color=theme.ink, fontsize=SMALL,
-                annotation_clip=False, fontweight="bold" if p.method == LEARNER else "normal",
+                for_figure(f"{p.method}  {end:.3f}"),
+                (bouts[-1], end),
+                (1.04, y),
+                textcoords=("axes fraction", "data"),
+                va="center",
+                color=theme.ink,
+                fontsize=SMALL,
+                annotation_clip=False,
+                fontweight="bold" if p.method == LEARNER else "normal",
                 arrowprops={
-                    "arrowstyle": "-", "shrinkA": 0, "shrinkB": 1, "relpos": (0, 0.5),
-                    "color": styles[p.method]["color"], "linestyle": styles[p.method]["linestyle"],
+                    "arrowstyle": "-",
+                    "shrinkA": 0,
+                    "shrinkB": 1,
+                    "relpos": (0, 0.5),
+                    "color": styles[p.method]["color"],
+                    "linestyle": styles[p.method]["linestyle"],
                 },
-            )  # fmt: skip
+            )
     headline(figure, theme, result.recording)
     foot(figure, theme, "each bout predicted before it is learned from")
     return figure
 
 
 def _method_styles(theme: Theme, result: LabyrinthStudy) -> dict[str, dict[str, Any]]:
-    """Looks of the methods without their markers, the learner's line above and wider than the others."""
+    """Return the methods' styles without markers, the learner's line above and wider than the others."""
     names = [p.method for view in result.views for p in view.predictions]
     styles = {
         name: {**style, "marker": None, "linewidth": 1.4}
@@ -104,7 +114,7 @@ def _spread(heights: Float[np.ndarray, " m"], gap: float) -> Float[np.ndarray, "
 
 
 def value_on_maze(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
-    """The learned value of every place on the maze, a panel for each view, one scale of colours for all."""
+    """Draw the learned value of every place on the maze, a panel a view, one scale of colours for all."""
     figure = new_figure(theme, 5.4 * len(result.views) + 0.9, 5.3)
     panels = figure.subplots(1, len(result.views), squeeze=False)[0]
     by_node = [
@@ -124,7 +134,7 @@ def value_on_maze(result: LabyrinthStudy, theme: Theme = LIGHT) -> Figure:
 def values_by_node(
     maze: Labyrinth, weights: Float[np.ndarray, " K"], values: Float[np.ndarray, " S"]
 ) -> Float[np.ndarray, " 127"]:
-    """The value of stepping into each node from above, what it brings on the step included.
+    """Compute the value of stepping into each node from above, with the reward of that step.
 
     NaN for the root, into which no step leads from above.
     """
@@ -166,15 +176,28 @@ def draw_maze(
         low, high = position[hidden].min(0) - 1.0, position[hidden].max(0) + 1.0
         style: dict[str, Any] = {"edgecolor": theme.muted, "linewidth": 0.0, "hatch": "//"}
         axes.add_patch(Rectangle(tuple(low), *(high - low), facecolor=theme.surface, alpha=0.45, **style))
-        axes.text((low[0] + high[0]) / 2, high[1] + 0.4, "out of view", ha="center", va="bottom",
-                  color=theme.ink, fontsize=TEXT)  # fmt: skip
+        axes.text(
+            (low[0] + high[0]) / 2,
+            high[1] + 0.4,
+            "out of view",
+            ha="center",
+            va="bottom",
+            color=theme.ink,
+            fontsize=TEXT,
+        )
     port, home = position[WATER_PORT], position[HOME]
     axes.plot(*port, "o", markersize=8, markerfacecolor=theme.goal, markeredgecolor=theme.surface)
     axes.plot(*home, "s", markersize=9, markerfacecolor=theme.surface, markeredgecolor=theme.ink)
     for place, name in ((port, "water"), (home, "home")):
         axes.annotate(
-            name, place, (0, -12), textcoords="offset points", ha="center", va="top", color=theme.ink,
+            name,
+            place,
+            (0, -12),
+            textcoords="offset points",
+            ha="center",
+            va="top",
+            color=theme.ink,
             fontsize=TEXT,
-        )  # fmt: skip
+        )
     axes.set(xlim=(-16, 16), ylim=(-19, 17), aspect="equal")
     axes.axis("off")

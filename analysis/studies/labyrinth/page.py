@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 
 
 def summary(result: LabyrinthStudy) -> dict[str, Any]:
-    """The study as plain numbers (for JSON): every method's scores, weights by feature, values by state."""
+    """Return the study as plain numbers (for JSON): every method's scores, weights by feature, values by
+    state.
+    """
     mdp = result.maze.mdp
     views: dict[str, Any] = {}
     for view in result.views:
@@ -50,21 +52,23 @@ def summary(result: LabyrinthStudy) -> dict[str, Any]:
             "intervals": None if (found := _estimates(result, view)) is None else found.summary(),
             "values": dict(zip(mdp.state_names, view.learned.values.tolist(), strict=True)),
         }
-    told: dict[str, Any] = plain({
-        "provenance": study_provenance(0),
-        "recording": result.recording,
-        "bouts": len(result.decisions),
-        "decisions": int(result.decisions.sum()),
-        "decisions_of_each_bout": result.decisions.tolist(),
-        "discount": float(mdp.discount),
-        "ridge": result.ridge,
-        "views": views,
-    })  # fmt: skip
+    told: dict[str, Any] = plain(
+        {
+            "provenance": study_provenance(0),
+            "recording": result.recording,
+            "bouts": len(result.decisions),
+            "decisions": int(result.decisions.sum()),
+            "decisions_of_each_bout": result.decisions.tolist(),
+            "discount": float(mdp.discount),
+            "ridge": result.ridge,
+            "views": views,
+        }
+    )
     return told
 
 
 def _estimates(result: LabyrinthStudy, view: ViewStudy) -> Estimates | None:
-    """All weights of a view with their errors; None where some of the maze was hidden."""
+    """List all weights of a view with their errors; None if part of the maze was hidden."""
     if view.learned.errors is None:
         return None
     return Estimates(result.maze.mdp.feature_names, view.learned.weights, view.learned.errors)
@@ -81,14 +85,16 @@ def tables(result: LabyrinthStudy) -> list[Table]:
             score = bits_per_decision(p.bits, result.decisions)
             delta = bits_per_decision(p.bits - first.bits, result.decisions)
             apart = p is not first
-            rows.append((
-                p.method,
-                f"{score.estimate:.3f} ({score.low:.3f} to {score.high:.3f})",
-                f"{delta.estimate:+.3f} ({delta.low:+.3f} to {delta.high:+.3f})" if apart else "-",
-                *([f"{p.bits_out_of_view.sum() / outside:.3f}"] if outside else []),
-                f"{p.afterwards:.3f}",
-                p.parameters,
-            ))  # fmt: skip
+            rows.append(
+                (
+                    p.method,
+                    f"{score.estimate:.3f} ({score.low:.3f} to {score.high:.3f})",
+                    f"{delta.estimate:+.3f} ({delta.low:+.3f} to {delta.high:+.3f})" if apart else "-",
+                    *([f"{p.bits_out_of_view.sum() / outside:.3f}"] if outside else []),
+                    f"{p.afterwards:.3f}",
+                    p.parameters,
+                )
+            )
         hidden = ["on hidden decisions"] if outside else []
         made.append(
             Table(
@@ -164,8 +170,8 @@ def _lead(result: LabyrinthStudy) -> Lead:
 
 def _text(result: LabyrinthStudy) -> str:
     views = [view.view for view in result.views]
-    return f"""Each bout is predicted before it is learned from, so that nothing is tested on what it \
-taught. The score is the code length of the animal's decisions, in bits; forced steps cost nobody anything. \
+    return f"""Each bout is predicted before it is learned from, so every test is on new \
+data. The score is the code length of the animal's decisions, in bits; forced steps cost zero bits. \
 Learned with: {listed(views)}.
 
 {LEARNER} learns a weight for each place reached and one each for turning round and going deeper. \
@@ -180,17 +186,21 @@ def write(result: LabyrinthStudy, folder: Path | str) -> Path:
 
     pictures = [
         drawn(
-            folder, "bits", lambda theme: bits_by_bout(result, theme),
+            folder,
+            "bits",
+            lambda theme: bits_by_bout(result, theme),
             "Running bits per decision, each bout predicted before it is learned from; lower is better.",
             "Bits per decision against bouts, a line a method",
         ),
         drawn(
-            folder, "value", lambda theme: value_on_maze(result, theme),
+            folder,
+            "value",
+            lambda theme: value_on_maze(result, theme),
             "Learned value of every place, entered from above: orange ones are worth less than zero, blue "
             "ones more. The maze is drawn as its environment draws it, home below.",
             "The maze with every corridor shaded by the learned value of the place it leads to",
         ),
-    ]  # fmt: skip
+    ]
     sections = [Section("Prediction", _text(result), tables(result), pictures)]
     return write_page(
         folder, f"What the mouse {result.recording} seeks", _lead(result), sections, summary(result)

@@ -1,34 +1,34 @@
-"""What can be learned from a mouse in the labyrinth: prediction, bout by bout, of bouts not yet seen.
+"""Study of a mouse in the labyrinth: prediction, bout by bout, of bouts not yet seen.
 
-Before a learner learns from a bout it says how probable each of its decisions is; the code length of what
-the animal then did, in bits per decision, is the score (prequential: nothing is tested on what it has
-learned from). Every step counts as a decision; those at ends are forced and cost nobody anything, so that
-uniform choice costs ``log2 3`` times the share of steps at junctions. The baselines learn in the same way,
-each a table of counts that start at one (Laplace's rule), renormalised over the available actions:
+A learner predicts each decision of a bout before learning from it; the score is the code length of the
+animal's decisions, in bits per decision (prequential: every test is on new data). Every step counts as a
+decision; those at ends are forced and cost zero bits, so uniform choice costs ``log2 3`` times the share of
+steps at junctions. The baselines learn in the same way, each a table of counts that start at one (Laplace's
+rule), renormalised over the available actions:
 
 ``uniform``
     over the available actions.
 ``frequencies``
-    of the actions over all steps. Forced steps back count too, which is what makes it worse than uniform;
+    of the actions over all steps. Forced steps back count too, which makes it worse than uniform;
     ``frequencies of choices`` leaves them out.
 ``given entry``
     frequencies given how the node was entered: from above, from either child, or as an end.
 ``Markov``
     frequencies per node and entry, a Markov chain over states; ``level and entry`` pools a level's nodes.
 
-Why the Markov chain stays ahead. It has two free numbers for each of 189 situations. A reward on the node
-reached, with *one* price for turning round and one for going deeper, cannot say that the animal turns at
-one level and goes on at another. Even fitted to the whole recording with hardly a prior (ridge 0.001) it
-needs 1.088 bits (D9a) and 1.079 (D9b), where the chain's maximum-likelihood fit takes 0.861 and 0.815: what
-is missing is not data. ``level and entry``, with 36 numbers, takes most of the distance, and so it is
-habits of a level more than places that the reward lacks; ``i2rl, by level``, whose prices differ from level
-to level, recovers about two thirds of the distance on D9a and two fifths on D9b.
+The Markov chain stays ahead for this reason. It has two free numbers for each of 189 situations. A reward on
+the node reached, with *one* weight for turning round and one for going deeper, cannot express that the animal
+turns at one level and goes on at another. Even fitted to the whole recording with hardly a prior (ridge
+0.001) it needs 1.088 bits (D9a) and 1.079 (D9b), where the chain's maximum-likelihood fit takes 0.861 and
+0.815: more data would not help. ``level and entry``, with 36 numbers, takes most of the distance, so the
+reward lacks habits of a level more than places; ``i2rl, by level``, whose weights differ from level to level,
+recovers about two thirds of the distance on D9a and two fifths on D9b.
 
-Discount and ridge were chosen by this score on D9a among discounts 0.3, 0.5, 0.7, 0.9 and ridges 2, 4, 8,
-16, 32; D9b took no part in it. Shorter horizons predict better throughout (discounts below 0.3 gain at most
-0.003 bits more). The likelihood without a prior hardly knows the discount, since a weight on every node can
-make up for it: what the discount sets is what the prior believes before there are data, and with a long
-horizon zero weights mean "seek out places with many ways on".
+Discount and ridge were chosen by this score on D9a among discounts 0.3, 0.5, 0.7, 0.9 and ridges 2, 4, 8, 16,
+32; D9b took no part in it. Shorter horizons predict better throughout (discounts below 0.3 gain at most 0.003
+bits more). The likelihood without a prior hardly depends on the discount, since a weight on every node can
+compensate for it: the discount sets the prior's behaviour, and with a long horizon zero weights mean "seek
+places with many exits".
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ LEARNER, BY_LEVEL, UNIFORM = "i2rl", "i2rl, by level", "uniform"
 
 
 class Prediction(NamedTuple):
-    """How well one method predicted each bout before learning from it.
+    """Prediction of each bout by one method before it learns from the bout.
 
     Fields
     ------
@@ -94,7 +94,7 @@ class Prediction(NamedTuple):
 
 
 class Learned(NamedTuple):
-    """What the learner knew at the end.
+    """State of the learner at the end.
 
     Fields
     ------
@@ -179,7 +179,7 @@ def labyrinth_study(
     ----------
     bouts : sequence of Bout
     recording : str
-        Its name, for the report.
+        Its name, for the page.
     discount, ridge : float
         Of the learner; the ridge is the precision of the Gaussian prior on its weights.
     hide_left : bool
@@ -254,7 +254,7 @@ def predict_with_learner(
 def predict_with_tables(
     maze: Labyrinth, demonstration: Demonstration, hidden: Bool[np.ndarray, " S"]
 ) -> list[Prediction]:
-    """The baselines, learning from the decisions in view and predicting all of them."""
+    """Predict all decisions by the baselines, which learn from the decisions in view."""
     n_states = maze.mdp.n_states
     choice = maze.choice
     everywhere, every_state = np.zeros(n_states, int), np.ones(n_states, bool)
@@ -285,7 +285,9 @@ def predict_with_table(
     context: Int[np.ndarray, " S"],
     teaches: Bool[np.ndarray, " S"],
 ) -> Prediction:
-    """Action frequencies given a context of the state, counted from one, in the states that ``teaches``."""
+    """Predict by action frequencies given a context of the state, counted from one, in the states that
+    ``teaches``.
+    """
     available = np.asarray(maze.mdp.available)
     counts = np.ones((context.max() + 1, available.shape[1]))
     teaches = teaches & ~hidden
@@ -302,7 +304,7 @@ def predict_with_table(
         state, action = row.state[row.kind == SEEN], row.action[row.kind == SEEN]
         learned = teaches[state]
         np.add.at(counts, (context[state[learned]], action[learned]), 1.0)
-    # A context in which nothing is ever chosen or learned has no free numbers.
+    # A context without choices or data has no free numbers.
     contexts = len(np.unique(context[maze.choice & teaches]))
     final = _code_lengths(log_policy(), demonstration)
     return _prediction(name, demonstration, hidden, bits, final, contexts * (available.shape[1] - 1))

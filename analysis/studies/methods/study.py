@@ -127,7 +127,7 @@ class MethodsStudy(NamedTuple):
 
     patrol: Patrol
     sessions: int
-    runs: int
+    replications: int
     seed: int
     points: Int[np.ndarray, " points"]
     curves: tuple[MethodCurve, ...]
@@ -147,9 +147,9 @@ class _Entry(NamedTuple):
 
 
 def turning_places(patrol: Patrol) -> Bool[np.ndarray, " S"]:
-    """Where a patroller turns round: it turns, and turns again in the same cell.
+    """Find where a patroller turns round: it turns, and turns again in the same cell.
 
-    The goals DARKO is told of, from the true policy: in its favour, for nobody else is told anything.
+    They are DARKO's goals, from the true policy: an advantage that the other methods do not have.
     """
     policy = patrol.expert_policy().argmax(1)
     turns = np.isin(policy, (LEFT, RIGHT))
@@ -161,13 +161,13 @@ def methods_study(
     number: int = 2,
     *,
     sessions: int = 120,
-    runs: int = 3,
+    replications: int = 3,
     seed: int = 0,
     learning_rates: Sequence[float] = RATES,
     methods: Sequence[str] | None = None,
     advance: Advance = lambda description, fraction: None,
 ) -> MethodsStudy:
-    """Run every method on the same fully observed patrols, ``runs`` times with each patroller a stream.
+    """Run every method ``replications`` times on the same fully observed patrols, a stream a patroller.
 
     A stream is ``sessions`` windows of five pairs. Windows are the sessions of all methods but DARKO, whose
     sessions end at the goals (:func:`turning_places`); what it learned at the last goal counts until the
@@ -183,7 +183,7 @@ def methods_study(
         raise ValueError(f"methods are {'; '.join(entries)}; got {unknown[0]!r}")
     entries = {name: entry for name, entry in entries.items() if methods is None or name in methods}
     points = np.unique(np.geomspace(1, sessions, 24).round().astype(int)) * PAIRS_PER_SESSION
-    streams = _streams(jax.random.key(seed), patrol, sessions, runs)
+    streams = _streams(jax.random.key(seed), patrol, sessions, replications)
     tuning = _streams(jax.random.key(seed + _TUNING), patrol, sessions, 1)
     curves, sweeps = [], {}
     for i, (name, entry) in enumerate(entries.items()):
@@ -207,7 +207,7 @@ def methods_study(
     return MethodsStudy(
         patrol,
         sessions,
-        runs,
+        replications,
         seed,
         points,
         tuple(curves),
@@ -239,16 +239,18 @@ def _entries(patrol: Patrol) -> dict[str, _Entry]:
 
 
 def chosen_learning_rate(learning_rates: Sequence[float], scores: Float[np.ndarray, " rates"]) -> float:
-    """The smallest rate whose score is within 0.01 of the best: larger ones gain too little to tell."""
+    """Choose the smallest rate whose score is within 0.01 of the best."""
     good = np.asarray(scores) >= np.max(scores) - 0.01
     return min(float(learning_rate) for learning_rate, kept in zip(learning_rates, good, strict=True) if kept)
 
 
-def _streams(key: Array, patrol: Patrol, sessions: int, runs: int) -> list[tuple[Array, Demonstration]]:
-    """A key for the first weights, and the windows, of every patroller of every run."""
+def _streams(
+    key: Array, patrol: Patrol, sessions: int, replications: int
+) -> list[tuple[Array, Demonstration]]:
+    """Simulate the windows of every patroller of every replication, with a key for its first weights."""
     return [
         (jax.random.fold_in(one, p), windows)
-        for one in jax.random.split(key, runs)
+        for one in jax.random.split(key, replications)
         for p, windows in enumerate(demonstrate(one, patrol, 100, sessions, PAIRS_PER_SESSION))
     ]
 
@@ -280,10 +282,10 @@ def _accuracies(
 
 
 def draw(study: MethodsStudy, theme: Theme) -> Figure:
-    """Accuracy against state-action pairs seen (logarithmic): medians, and bands of the middle half.
+    """Draw accuracy against state-action pairs seen (logarithmic): medians, and bands of the middle half.
 
-    One panel a family of methods, since six bands cannot be told apart; the last method, this library's
-    default, is repeated in all of them as a thin line to compare with.
+    One panel a family of methods, since six bands would overlap; the last method, this library's default, is
+    repeated in all of them as a thin line to compare with.
     """
     figure = new_figure(theme, 9.6, 4.4)
     reference = study.curves[-1]
@@ -327,29 +329,31 @@ def _family(name: str) -> str:
 
 
 def summary(study: MethodsStudy) -> dict[str, Any]:
-    """Settings, curves, sweeps and the live Table 8.1 as plain data."""
-    told: dict[str, Any] = plain({
-        "provenance": study_provenance(study.seed),
-        "patrol": study.patrol.name,
-        "sessions": study.sessions,
-        "runs": study.runs,
-        "seed": study.seed,
-        "pairs": study.points.tolist(),
-        "methods": [
-            {
-                "method": curve.name,
-                "learning rate": curve.learning_rate,
-                "median accuracy": np.median(curve.accuracy, axis=0).tolist(),
-                "pairs to 90 %": _pairs_to(study, curve, 0.9),
-                "weights": curve.weights,
-            }
-            for curve in study.curves
-        ],
-        "sweeps": {name: scores.tolist() for name, scores in study.sweeps.items()},
-        "table 8.1": study.table.to_dict("records"),
-        "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
-        "weights, first stream": None if (found := _estimates(study)) is None else found.summary(),
-    })  # fmt: skip
+    """Return settings, curves, sweeps and the live Table 8.1 as plain data."""
+    told: dict[str, Any] = plain(
+        {
+            "provenance": study_provenance(study.seed),
+            "patrol": study.patrol.name,
+            "sessions": study.sessions,
+            "replications": study.replications,
+            "seed": study.seed,
+            "pairs": study.points.tolist(),
+            "methods": [
+                {
+                    "method": curve.name,
+                    "learning rate": curve.learning_rate,
+                    "median accuracy": np.median(curve.accuracy, axis=0).tolist(),
+                    "pairs to 90 %": _pairs_to(study, curve, 0.9),
+                    "weights": curve.weights,
+                }
+                for curve in study.curves
+            ],
+            "sweeps": {name: scores.tolist() for name, scores in study.sweeps.items()},
+            "table 8.1": study.table.to_dict("records"),
+            "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
+            "weights, first stream": None if (found := _estimates(study)) is None else found.summary(),
+        }
+    )
     return told
 
 
@@ -378,11 +382,14 @@ def _tables(study: MethodsStudy) -> tuple[Table, ...]:
     for curve in study.curves:
         band = quantile_band(curve.accuracy[:, -1])
         reached = _pairs_to(study, curve, 0.9)
-        results.append((
-            curve.name, "-" if curve.learning_rate is None else f"{curve.learning_rate:g}",
-            "never" if reached is None else f"{reached}",
-            f"{100 * band.median:.1f} % ({100 * band.low:.0f}-{100 * band.high:.0f})",
-        ))  # fmt: skip
+        results.append(
+            (
+                curve.name,
+                "-" if curve.learning_rate is None else f"{curve.learning_rate:g}",
+                "never" if reached is None else f"{reached}",
+                f"{100 * band.median:.1f} % ({100 * band.low:.0f}-{100 * band.high:.0f})",
+            )
+        )
     sweep = [(name, *(f"{score:.3f}" for score in scores)) for name, scores in study.sweeps.items()]
     live = [tuple(row) for row in study.table.itertuples(index=False)]
     return (
@@ -397,7 +404,7 @@ def _tables(study: MethodsStudy) -> tuple[Table, ...]:
                 *(f"rate {learning_rate:g}" for learning_rate in study.learning_rates),
             ),
             sweep,
-            "On a run used for nothing else. Above, each method has the smallest rate within 0.01 of its "
+            "On a further replication. Above, each method has the smallest rate within 0.01 of its "
             "best. A reward table over states learns the same policy at every rate.",
         ),
         Table(
@@ -413,7 +420,7 @@ def _tables(study: MethodsStudy) -> tuple[Table, ...]:
 
 _TEXT = """Every method is given the same pairs, all of them in view. Windows of five pairs are a session, \
 which for the method of Jin et al. is five sessions of one pair; DARKO's sessions also come as it has them, \
-from goal to goal, the goals (where a patroller turns round) being told to it alone. Jin's reward is a table \
+from goal to goal; only it is given the goals (where a patroller turns round). Jin's reward is a table \
 over states and cannot say what an action costs; its second form has the features that the others have.
 
 The patrollers pass one another by stopping, which no reward explains, and they are deterministic, which a \
@@ -469,9 +476,11 @@ def print_tables(study: MethodsStudy, console: Console) -> None:
 def write(study: MethodsStudy, folder: Path | str) -> Path:
     """Write the page: ``index.html``, the picture in both themes, and ``results.json``."""
     picture = drawn(
-        folder, "methods", partial(draw, study),
+        folder,
+        "methods",
+        partial(draw, study),
         "Accuracy of the learned behaviour against the number of state-action pairs seen.",
         "Learned behaviour accuracy of each online method against pairs seen, on a logarithmic axis",
-    )  # fmt: skip
+    )
     section = Section("Methods compared", _TEXT, _tables(study), [picture])
     return write_page(folder, _title(study), _lead(study), [section], summary(study))

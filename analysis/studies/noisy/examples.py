@@ -1,4 +1,4 @@
-"""What came of noisy reports: a sensor beside its posterior, one trajectory, and how onions are sorted."""
+"""Examples of noisy observations: a sensor beside its posterior, one trajectory, and sorted onions."""
 
 from __future__ import annotations
 
@@ -28,16 +28,19 @@ STRIP_STEPS = 12
 BELTS = 1000
 # The table of Figure 7.9, one belt each; its heading names the last two columns the wrong way round.
 PUBLISHED = {
-    EXPERT: Counts(7, 0, 12, 5), "RIMEO": Counts(8, 1, 11, 4), "RIFOM": Counts(8, 3, 9, 4),
-    "AIRL": Counts(5, 4, 8, 7), "MLIRL": Counts(7, 3, 9, 5),
-}  # fmt: skip
+    EXPERT: Counts(7, 0, 12, 5),
+    "RIMEO": Counts(8, 1, 11, 4),
+    "RIFOM": Counts(8, 3, 9, 4),
+    "AIRL": Counts(5, 4, 8, 7),
+    "MLIRL": Counts(7, 3, 9, 5),
+}
 
 
 # -- the sensor ---------------------------------------------------------------------------------------
 
 
 class SensorPosterior(NamedTuple):
-    """Agreement of features: by NUTS, by RIMEO, truly, and as it happened to be.
+    """Agreement of features: by NUTS, by RIMEO, in truth, and in the data.
 
     Fields
     ------
@@ -45,9 +48,9 @@ class SensorPosterior(NamedTuple):
     draws : float ``[draws, J]``
     learned, truth : float ``[J]``
     happened : float ``[J]``
-        Share of the reports learned from that agree with what they are of.
+        Share of the observations learned from that agree with their truth.
     trajectories, divergences : int
-        That were learned from; divergent transitions of NUTS.
+        Trajectories learned from; divergent transitions of NUTS.
     reward : float ``[draws, K]`` or None
         Weights of the same draws.
     """
@@ -84,19 +87,22 @@ def sensor_posterior(
     agreement = np.asarray(_agreement(jnp.asarray(task.features), jnp.asarray(pairs), reliabilities))
     reports, pairs_done = (task.features[:, d.state, d.action] for d in (seen, truth))
     return SensorPosterior(
-        task.feature_names, agreement, np.asarray(learned),
-        agreement_probabilities(task.noise, task.features, pairs), (reports == pairs_done).mean((1, 2)),
+        task.feature_names,
+        agreement,
+        np.asarray(learned),
+        agreement_probabilities(task.noise, task.features, pairs),
+        (reports == pairs_done).mean((1, 2)),
         seen.n_trajectories,
         int(np.asarray(data["sample_stats"]["diverging"]).sum()),
         np.asarray(data["posterior"]["weights"]).reshape(len(reliabilities), -1),
-    )  # fmt: skip
+    )
 
 
 @jax.jit
 def _agreement(
     features: Int[Array, "J S A"], pairs: Float[Array, "S A"], reliabilities: Float[Array, "draws J"]
 ) -> Float[Array, "draws J"]:
-    """As :func:`agreement_probabilities` of a :class:`FeatureNoise`, for many of them."""
+    """Compute :func:`agreement_probabilities` of many :class:`FeatureNoise`."""
 
     def one(p: Float[Array, " J"]) -> Float[Array, " J"]:
         return jnp.einsum("sa,jsa->j", pairs / pairs.sum(), FeatureNoise(features, p).agreement())
@@ -132,7 +138,7 @@ def strip(
     starts: Starts = "natural",
     steps: int = STRIP_STEPS,
 ) -> Strip:
-    """A fresh trajectory, interpreted with a learned reward and sensor."""
+    """Complete a fresh trajectory with a learned reward and sensor."""
     drawn = demonstrate_noisy(key, task, sessions=1, trajectories=1, steps=steps, starts=starts)
     sensor = FeatureNoise(task.features, np.asarray(reliabilities))
     pairs = _interpreted(drawn.mdp, sensor, jnp.asarray(weights), drawn.seen)
@@ -151,13 +157,17 @@ def _interpreted(
 
 
 def sorted_belts(
-    key: Array, task: NoisyTask, learned: Mapping[str, Float[np.ndarray, "runs K"]], *, belts: int = BELTS
+    key: Array,
+    task: NoisyTask,
+    learned: Mapping[str, Float[np.ndarray, "replications K"]],
+    *,
+    belts: int = BELTS,
 ) -> SortingTable:
-    """What the expert's and the learned policies do on simulated belts, beside the table of Figure 7.9.
+    """Tally the expert's and the learned policies on simulated belts, beside the table of Figure 7.9.
 
-    The runs of a method share about ``belts`` belts, equally many each and at least one. Its tally has one
-    entry a run, the sum over that run's belts: belts sorted with one policy are not independent. A method
-    whose name begins with that of a published row has it beside it.
+    The replications of a method share about ``belts`` belts, equally many each and at least one. Its tally
+    has one entry a run, the sum over that run's belts: belts sorted with one policy are not independent. A
+    method whose name begins with that of a published row has it beside it.
     """
     sorting, line = pick_inspect_place(), Line()
     optimal = optimal_actions(task.mdp, jnp.asarray(task.weights))
@@ -177,10 +187,14 @@ def sorted_belts(
         taken |= {published} if published else set()
         rows.append(
             SortingRow(
-                method, sorting.behaviours[0], Tally(*np.array(sums).T), float(overall), float(choice),
+                method,
+                sorting.behaviours[0],
+                Tally(*np.array(sums).T),
+                float(overall),
+                float(choice),
                 PUBLISHED[published] if published else None,
             )
-        )  # fmt: skip
+        )
     return SortingTable(tuple(rows), belts, line, 0.95)
 
 
@@ -192,7 +206,7 @@ def per_belt(row: SortingRow) -> tuple[float, ...]:
 
 
 def _sorting_runs(table: SortingTable, row: SortingRow) -> str:
-    """How many runs have at least half the expert's recall."""
+    """Count the replications that have at least half the expert's recall."""
     if row.method == EXPERT:
         return ""
     enough = table.rows[0].tally.recall().value / 2
@@ -200,11 +214,21 @@ def _sorting_runs(table: SortingTable, row: SortingRow) -> str:
     return f"{(row.tally.true_positives >= enough * blemished).sum()} of {len(blemished)}"
 
 
-HEADINGS = ("method", "belts", "TP, FP, TN, FN", "precision, %", "recall, %", "runs that sort", "LBA, %")
+HEADINGS = (
+    "method",
+    "belts",
+    "TP, FP, TN, FN",
+    "precision, %",
+    "recall, %",
+    "replications that sort",
+    "LBA, %",
+)
 
 
 def belt_cells(table: SortingTable) -> list[tuple[str, ...]]:
-    """The rows as text under :data:`HEADINGS`, published ones beside ours, and those we have no row for."""
+    """Format the rows as text under :data:`HEADINGS`, published ones beside ours, and those we have no row
+    for.
+    """
 
     def percent(share: Share, digits: int) -> str:
         if math.isnan(share.value):

@@ -60,16 +60,16 @@ def _draw_mean(
     axes: Axes,
     theme: Theme,
     result: MethodResult,
-    runs: Float[np.ndarray, "runs T"],
+    replications: Float[np.ndarray, "replications T"],
     top: float = np.inf,
 ) -> None:
     """Draw a method's mean and its band, which ends at ``top`` and at a fifth of the mean.
 
-    The normal interval knows nothing of either end of a scale; a logarithmic one has no zero.
+    The normal interval ignores the ends of a scale; a logarithmic one has no zero.
     """
-    style, band = method_styles(theme, [result.name])[result.name], mean_interval(runs)
+    style, band = method_styles(theme, [result.name])[result.name], mean_interval(replications)
     x = result.sessions
-    if len(runs) > 1:
+    if len(replications) > 1:
         low, high = np.maximum(band.low, band.mean / 5), np.minimum(band.high, top)
         axes.fill_between(x, low, high, color=style["color"], alpha=0.18, linewidth=0)
     axes.plot(
@@ -83,20 +83,27 @@ def _panels(figure: Figure, n: int) -> np.ndarray:
 
 
 def _legend_above(panel: Axes, theme: Theme, title: str) -> None:
-    """A panel's own title and legend: more methods than there are styles share a figure."""
+    """Set a panel's own title and legend: more methods than there are styles share a figure."""
     legend = panel.legend(
-        title=title, loc="lower left", bbox_to_anchor=(-0.03, 1.0), ncols=2, frameon=False, fontsize=TEXT - 1,
-        title_fontsize=TITLE, alignment="left", labelcolor=theme.ink,
-    )  # fmt: skip
+        title=title,
+        loc="lower left",
+        bbox_to_anchor=(-0.03, 1.0),
+        ncols=2,
+        frameon=False,
+        fontsize=TEXT - 1,
+        title_fontsize=TITLE,
+        alignment="left",
+        labelcolor=theme.ink,
+    )
     legend.get_title().set_color(theme.ink)
 
 
-def _mean_of(runs: int, interval: str = "band") -> str:
+def _mean_of(replications: int, interval: str = "band") -> str:
     """Small print of a figure of means."""
     return (
-        "line: one run"
-        if runs == 1
-        else f"line: mean of {counted(runs, 'run')}; {interval}: its 95% interval"
+        "line: one replication"
+        if replications == 1
+        else f"line: mean of {counted(replications, 'replication')}; {interval}: its 95% interval"
     )
 
 
@@ -106,7 +113,7 @@ def _count_sessions(panel: Axes, sessions: int) -> None:
 
 
 def divergence_plot(study: NoisyStudy, theme: Theme) -> Figure:
-    """Divergence of the learned sensor against sessions, logarithmic: ways of learning it, and controls."""
+    """Draw the divergence of the learned sensor against sessions, logarithmic, for learners and controls."""
     groups = (
         ("RIMEO", (PLAIN, AVERAGED, STEPWISE, BARE)),
         ("Controls", (ORACLE, OBSERVED, FAIR, CODED, ALL)),
@@ -126,9 +133,12 @@ def divergence_plot(study: NoisyStudy, theme: Theme) -> Figure:
         assert reference.divergence is not None
         if PLAIN not in names:
             panel.plot(
-                reference.sessions, reference.divergence.mean(0), color=theme.muted, linewidth=1.0,
+                reference.sessions,
+                reference.divergence.mean(0),
+                color=theme.muted,
+                linewidth=1.0,
                 label=f"{PLAIN} (again)",
-            )  # fmt: skip
+            )
         dress(panel, theme, x="session")
         _legend_above(panel, theme, title)
         set_scale(panel, "y", "log")
@@ -138,7 +148,7 @@ def divergence_plot(study: NoisyStudy, theme: Theme) -> Figure:
         "divergence of agreement probabilities\n(nats, mean over predicates)", color=theme.ink
     )
     head(figure, theme, [], title=f"What is learned of perception, {study.task.name}")
-    foot(figure, theme, _mean_of(study.runs))
+    foot(figure, theme, _mean_of(study.replications))
     return figure
 
 
@@ -185,8 +195,8 @@ def accuracy_plot(study: NoisyStudy, theme: Theme) -> Figure:
         figure, theme, panels[0].get_legend_handles_labels()[0], title=f"Behaviour learned, {study.task.name}"
     )
     few = {len(study.results[m].weights) for m in (ROBUST, MLIRL) if m in study.results}
-    batch = f"; batch: all sessions at once, {counted(few.pop(), 'run')}" if few else ""
-    foot(figure, theme, _mean_of(study.runs, "band and bar") + batch)
+    batch = f"; batch: all sessions at once, {counted(few.pop(), 'replication')}" if few else ""
+    foot(figure, theme, _mean_of(study.replications, "band and bar") + batch)
     return figure
 
 
@@ -200,39 +210,90 @@ def sensor_plot(posterior: SensorPosterior, theme: Theme) -> Figure:
     axes.hlines(y, band.low, band.high, color=theme.series[0], linewidth=3.0, alpha=0.6)
     axes.plot(band.median, y, linestyle="", marker="o", markersize=6, color=theme.series[0])
     axes.plot(
-        posterior.truth, y, linestyle="", marker="D", markersize=9, markerfacecolor="none",
-        markeredgewidth=1.7, color=theme.series[1], clip_on=False,
-    )  # fmt: skip
+        posterior.truth,
+        y,
+        linestyle="",
+        marker="D",
+        markersize=9,
+        markerfacecolor="none",
+        markeredgewidth=1.7,
+        color=theme.series[1],
+        clip_on=False,
+    )
     axes.plot(
-        posterior.learned, y, linestyle="", marker="|", markersize=13, markeredgewidth=2.4,
-        color=theme.series[2], clip_on=False,
-    )  # fmt: skip
+        posterior.learned,
+        y,
+        linestyle="",
+        marker="|",
+        markersize=13,
+        markeredgewidth=2.4,
+        color=theme.series[2],
+        clip_on=False,
+    )
     axes.plot(
-        posterior.happened, y + 0.26, linestyle="", marker="x", markersize=6, markeredgewidth=1.6,
-        color=theme.ink, clip_on=False,
-    )  # fmt: skip
-    dress(axes, theme, x="probability that a report agrees with the truth", grid="x")
+        posterior.happened,
+        y + 0.26,
+        linestyle="",
+        marker="x",
+        markersize=6,
+        markeredgewidth=1.6,
+        color=theme.ink,
+        clip_on=False,
+    )
+    dress(axes, theme, x="probability that an observation agrees with the truth", grid="x")
     name_ticks(axes, "y", y, posterior.names, fontsize=TEXT)
     axes.set_ylim(n - 0.4, -0.6)
     least = np.min([band.low, posterior.truth, posterior.learned, posterior.happened])
     axes.set_xlim(max(least - 0.03, 0.0), 1.0)
     handles: list[Artist] = [
-        Line2D([], [], color=theme.series[0], marker="o", linewidth=3, markersize=6,
-               label="posterior: median, middle 90%"),
-        Line2D([], [], color=theme.series[2], marker="|", linestyle="", markersize=13, markeredgewidth=2.4,
-               label=PLAIN),
-        Line2D([], [], color=theme.series[1], marker="D", linestyle="", markersize=8, markerfacecolor="none",
-               markeredgewidth=1.7, label="truth"),
-        Line2D([], [], color=theme.ink, marker="x", linestyle="", markersize=6, markeredgewidth=1.6,
-               label="share of these reports"),
-    ]  # fmt: skip
+        Line2D(
+            [],
+            [],
+            color=theme.series[0],
+            marker="o",
+            linewidth=3,
+            markersize=6,
+            label="posterior: median, middle 90%",
+        ),
+        Line2D(
+            [],
+            [],
+            color=theme.series[2],
+            marker="|",
+            linestyle="",
+            markersize=13,
+            markeredgewidth=2.4,
+            label=PLAIN,
+        ),
+        Line2D(
+            [],
+            [],
+            color=theme.series[1],
+            marker="D",
+            linestyle="",
+            markersize=8,
+            markerfacecolor="none",
+            markeredgewidth=1.7,
+            label="truth",
+        ),
+        Line2D(
+            [],
+            [],
+            color=theme.ink,
+            marker="x",
+            linestyle="",
+            markersize=6,
+            markeredgewidth=1.6,
+            label="share of these observations",
+        ),
+    ]
     head(figure, theme, handles, title="How reliable each feature is thought to be", columns=2)
     foot(figure, theme, f"learned from {counted(posterior.trajectories, 'trajectory')} without scores")
     return figure
 
 
 def strip_plot(strip: Strip, mdp: TabularMDP, theme: Theme) -> Figure:
-    """A trajectory step by step: what was seen, what happened, and the posterior mass of each pair."""
+    """Draw a trajectory step by step: the observation, the truth, and the posterior mass of each pair."""
     length = len(strip.posterior)
     seen = strip.seen.state[0] * mdp.n_actions + strip.seen.action[0]
     true = strip.truth.state[0] * mdp.n_actions + strip.truth.action[0]
@@ -249,13 +310,21 @@ def strip_plot(strip: Strip, mdp: TabularMDP, theme: Theme) -> Figure:
     )
     steps = np.arange(length)
     seen_style: dict[str, Any] = {
-        "linestyle": "", "marker": "s", "markersize": 14, "markerfacecolor": "none",
-        "markeredgecolor": theme.series[1], "markeredgewidth": 2.0,
-    }  # fmt: skip
+        "linestyle": "",
+        "marker": "s",
+        "markersize": 14,
+        "markerfacecolor": "none",
+        "markeredgecolor": theme.series[1],
+        "markeredgewidth": 2.0,
+    }
     true_style: dict[str, Any] = {
-        "linestyle": "", "marker": "o", "markersize": 6.5, "markerfacecolor": theme.surface,
-        "markeredgecolor": theme.ink, "markeredgewidth": 1.2,
-    }  # fmt: skip
+        "linestyle": "",
+        "marker": "o",
+        "markersize": 6.5,
+        "markerfacecolor": theme.surface,
+        "markeredgecolor": theme.ink,
+        "markeredgewidth": 1.2,
+    }
     axes.plot(steps, [row[int(g)] for g in seen], **seen_style)
     axes.plot(steps, [row[int(g)] for g in true], **true_style)
     dress(axes, theme, x="step", grid=None)
@@ -268,8 +337,9 @@ def strip_plot(strip: Strip, mdp: TabularMDP, theme: Theme) -> Figure:
     bar = figure.colorbar(picture, ax=axes, pad=0.01, fraction=0.03)
     dress_bar(bar, theme, "posterior probability")
     handles: list[Artist] = [
-        Line2D([], [], label="seen", **seen_style), Line2D([], [], label="happened", **true_style)
-    ]  # fmt: skip
+        Line2D([], [], label="seen", **seen_style),
+        Line2D([], [], label="happened", **true_style),
+    ]
     wrong = int((seen != true).sum())
     head(
         figure,

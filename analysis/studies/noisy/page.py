@@ -1,4 +1,4 @@
-"""The study of noisy perception told: tables, figures, and the report that ``i2rl run noisy-...`` writes."""
+"""Page of the study of noisy perception, which ``i2rl run noisy-...`` writes: tables and figures."""
 
 from __future__ import annotations
 
@@ -48,51 +48,57 @@ TARGETS = {PLAIN: (1 / 6, 1 / 12), AVERAGED: (1 / 12, 1 / 24), STEPWISE: (1 / 12
 
 
 def summary(study: NoisyStudy) -> dict[str, Any]:
-    """Settings and all measures as plain data."""
-    told: dict[str, Any] = plain({
-        "provenance": study_provenance(study.seed),
-        "task": study.task.name,
-        "starts": study.starts,
-        "runs": study.runs,
-        "sessions": study.sessions,
-        "trajectories a session": TRAJECTORIES,
-        "steps": STEPS,
-        "seed": study.seed,
-        "true agreement": dict(zip(study.task.predicate_names, study.true_agreement.tolist(), strict=True)),
-        "divergence of one half": study.control,
-        "methods": [
-            {
-                "method": name,
-                "runs": len(result.weights),
-                "weights": result.weights[:, -1],
-                "sessions": result.sessions.tolist(),
-                "divergence": _described(result.divergence if _quotable(study, name) else None),
-                "accuracy": {states: _described(result.accuracy[..., i]) for i, states in enumerate(STATES)},
-            }
-            for name, result in study.results.items()
-        ],
-        "hidden": None
-        if study.hidden is None
-        else {name: _described(result.accuracy[..., 0]) for name, result in study.hidden.items()},
-        "seconds a session": dict(study.seconds),
-        "identified": {method: doubt.known for method, doubt in study.doubt.items()},
-        "reliabilities": None
-        if study.posterior is None
-        else {
-            "features": list(study.posterior.names),
-            "trajectories": study.posterior.trajectories,
-            "posterior mean": study.posterior.draws.mean(0).tolist(),
-            "learned": study.posterior.learned.tolist(),
-            "truth": study.posterior.truth.tolist(),
-            "in these reports": study.posterior.happened.tolist(),
-            "divergent transitions": study.posterior.divergences,
-        },
-        "features": list(study.task.mdp.feature_names),
-        "true weights": study.task.weights,
-        "reward, first run": None if (found := _reward(study)) is None else found,
-        "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
-        "belts": None if study.belts is None else sorting_table_summary(study.belts),
-    })  # fmt: skip
+    """Return settings and all measures as plain data."""
+    told: dict[str, Any] = plain(
+        {
+            "provenance": study_provenance(study.seed),
+            "task": study.task.name,
+            "starts": study.starts,
+            "replications": study.replications,
+            "sessions": study.sessions,
+            "trajectories a session": TRAJECTORIES,
+            "steps": STEPS,
+            "seed": study.seed,
+            "true agreement": dict(
+                zip(study.task.predicate_names, study.true_agreement.tolist(), strict=True)
+            ),
+            "divergence of one half": study.control,
+            "methods": [
+                {
+                    "method": name,
+                    "replications": len(result.weights),
+                    "weights": result.weights[:, -1],
+                    "sessions": result.sessions.tolist(),
+                    "divergence": _described(result.divergence if _quotable(study, name) else None),
+                    "accuracy": {
+                        states: _described(result.accuracy[..., i]) for i, states in enumerate(STATES)
+                    },
+                }
+                for name, result in study.results.items()
+            ],
+            "hidden": None
+            if study.hidden is None
+            else {name: _described(result.accuracy[..., 0]) for name, result in study.hidden.items()},
+            "seconds a session": dict(study.seconds),
+            "identified": {method: doubt.known for method, doubt in study.doubt.items()},
+            "reliabilities": None
+            if study.posterior is None
+            else {
+                "features": list(study.posterior.names),
+                "trajectories": study.posterior.trajectories,
+                "posterior mean": study.posterior.draws.mean(0).tolist(),
+                "learned": study.posterior.learned.tolist(),
+                "truth": study.posterior.truth.tolist(),
+                "in these observations": study.posterior.happened.tolist(),
+                "divergent transitions": study.posterior.divergences,
+            },
+            "features": list(study.task.mdp.feature_names),
+            "true weights": study.task.weights,
+            "reward, first replication": None if (found := _reward(study)) is None else found,
+            "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
+            "belts": None if study.belts is None else sorting_table_summary(study.belts),
+        }
+    )
     return told
 
 
@@ -119,10 +125,12 @@ def _reward(study: NoisyStudy) -> list[dict[str, Any]] | None:
     ]
 
 
-def _described(runs: Float[np.ndarray, "runs T"] | None) -> dict[str, list[float | None]] | None:
-    if runs is None:
+def _described(
+    replications: Float[np.ndarray, "replications T"] | None,
+) -> dict[str, list[float | None]] | None:
+    if replications is None:
         return None
-    band = mean_interval(runs)
+    band = mean_interval(replications)
     return {
         name: [None if math.isnan(x) else x for x in values.tolist()]
         for name, values in zip(("mean", "low", "high"), band, strict=True)
@@ -132,8 +140,10 @@ def _described(runs: Float[np.ndarray, "runs T"] | None) -> dict[str, list[float
 # -- tables -------------------------------------------------------------------------------------------
 
 
-def _with_interval(runs: Float[np.ndarray, " runs"], scale: float = 1.0, digits: int = 1) -> str:
-    band = mean_interval(scale * np.asarray(runs))
+def _with_interval(
+    replications: Float[np.ndarray, " replications"], scale: float = 1.0, digits: int = 1
+) -> str:
+    band = mean_interval(scale * np.asarray(replications))
     if np.isnan(band.low):
         return f"{band.mean:.{digits}f}"
     return f"{band.mean:.{digits}f} ({band.low:.{digits}f}-{band.high:.{digits}f})"
@@ -160,28 +170,36 @@ def sensor_table(study: NoisyStudy) -> Table:
         rows.append(tuple(cells))  # type: ignore[arg-type]
     return Table(
         (
-            "estimate", f"after {early}", "of one half", "at most",
-            f"after {late}", "of one half", "at most",
+            "estimate",
+            f"after {early}",
+            "of one half",
+            "at most",
+            f"after {late}",
+            "of one half",
+            "at most",
         ),
         rows,
         "Kullback-Leibler divergence of the learned agreement probabilities from the true ones in nats, mean "
-        "over predicates, after so many sessions: mean of runs (95 % interval). At most: shares to reach "
+        "over predicates, after so many sessions: mean of replications (95 % interval). "
+        "At most: shares to reach "
         "after 6 and 20 sessions of all starts.",
-    )  # fmt: skip
+    )
 
 
 def _identified(study: NoisyStudy, method: str) -> bool:
-    """Whether the sensor is known in at least half of the runs; what was not asked is not doubted."""
+    """Test whether the sensor is identified in at least half of the replications; true if that was not
+    tested.
+    """
     return method not in study.doubt or study.doubt[method].known >= 0.5
 
 
 def _quotable(study: NoisyStudy, method: str) -> bool:
-    """Whether an estimate of the sensor may be quoted: one without scores only if such a sensor is known."""
+    """Test whether to quote a sensor's estimate: one without scores only if the sensor is identified."""
     return method not in (PLAIN, BARE) or _identified(study, PLAIN)
 
 
 def doubt_table(study: NoisyStudy) -> Table:
-    """Whose errors they are: agreement under what may be assumed of the expert."""
+    """Tabulate whose the errors are: agreement under assumptions about the expert."""
     rows: list[tuple[str, ...]] = []
     for method, doubt in study.doubt.items():
         for j, name in enumerate(study.task.predicate_names):
@@ -190,17 +208,25 @@ def doubt_table(study: NoisyStudy) -> Table:
                     method if j == 0 else "",
                     name,
                     _with_interval(doubt.erratic[:, j], digits=2),
-                    _with_interval(doubt.decided[:, j], digits=2),
+                    _with_interval(doubt.optimal[:, j], digits=2),
                     f"{study.true_agreement[j]:.2f}",
                     f"{doubt.identified[:, j].sum()} of {len(doubt.identified)}",
                 )
             )
     return Table(
-        ("learner", "predicate", "if the expert errs", "if he is decided", "truth", "runs identified"),
+        (
+            "learner",
+            "predicate",
+            "if the expert errs",
+            "if the expert is optimal",
+            "truth",
+            "replications identified",
+        ),
         rows,
-        "Agreement of reports with the truth, fitted to all reports of a run under the reward it learned, "
-        "for an expert as erratic as was learned and for one who always does what is best; mean of runs "
-        "(95 % interval). Where the two are more than 0.05 apart, reports do not say whose the errors are.",
+        "Agreement of observations with the truth, fitted to all observations under the learned reward, "
+        "for an expert as erratic as learned and for an optimal one; mean of replications "
+        "(95 % interval). If the two are more than 0.05 apart, observations do not identify whose "
+        "the errors are.",
     )
 
 
@@ -213,10 +239,11 @@ def behaviour_table(study: NoisyStudy) -> Table:
         for name, result in study.results.items()
     ]
     return Table(
-        ("method", "runs", *headings),
+        ("method", "replications", *headings),
         rows,
         f"LBA after {study.sessions} sessions: share of states in which the greedy action is one of the "
-        "expert's optimal ones; mean of runs (95 % interval). Choice: more than one action is available; "
+        "expert's optimal ones; mean of replications (95 % interval). "
+        "Choice: more than one action is available; "
         "reachable: from where the task naturally starts, by any actions.",
     )
 
@@ -236,7 +263,8 @@ def hidden_table(study: NoisyStudy) -> Table:
         (f"{OBSERVABILITY} % in view", f"LBA after {early}, %", f"LBA after {study.sessions}, %"),
         rows,
         f"Sessions of {TRAJECTORIES} trajectories of {HIDDEN_STEPS} steps, the same paths in both rows. "
-        f"Hidden: reports are exact (LME-I2RL); hidden and noisy: {PLAIN}. Lost: paired over runs.",
+        f"Hidden: observations are exact (LME-I2RL); hidden and noisy: {PLAIN}. Lost: paired over "
+        f"replications.",
     )
 
 
@@ -263,7 +291,8 @@ def belts_table(study: NoisyStudy) -> Table:
         HEADINGS,
         belt_cells(study.belts),
         caption(study.belts)
-        + " Belts of a method are divided among its runs, and its intervals are over runs. Runs that sort "
+        + " Belts of a method are divided among its replications, and its intervals are over "
+        "replications. Replications that sort "
         "have at least half the expert's recall. The dissertation heads its last two columns the other way "
         "round; its percentages fit the order given here.",
     )
@@ -293,37 +322,38 @@ def _title(study: NoisyStudy) -> str:
 
 def _text(study: NoisyStudy) -> str:
     bare = (
-        f"{BARE!r} has nothing but the dissertation's predicates; all pairs that they do not tell apart are "
-        "then reported at random, as far as it knows. The other learners also know parts of a pair that "
-        f"perception might mistake ({', '.join(study.task.label_names)}); that they are clear is learned. "
+        f"{BARE!r} has only the dissertation's predicates; in its model, pairs with equal predicates are "
+        "observed at random. The other learners also have labels of a pair that "
+        f"perception might confuse ({', '.join(study.task.label_names)}); they learn that these are clear. "
         if BARE in study.results
         else ""
     )
     natural = (
-        "\n\nAll trajectories start alike and are short, so reports without scores hardly identify the "
-        "sensor: an odd report may be wrong, or the expert may be odd. Scores tell the two apart. "
+        "\n\nAll trajectories start alike and are short, so observations without scores hardly identify the "
+        "sensor: an odd observation may be wrong, or the expert may be odd. Scores distinguish the two. "
         "LBA over all states counts those that are never visited, too."
         if study.starts == "natural"
         else ""
     )
-    return f"""An expert acts optimally; every pair of its trajectories is reported, some of them wrongly. \
-The learner knows neither how often nor which. There {"is" if study.runs == 1 else "are"} \
-{counted(study.runs, "independent run")} of {counted(study.sessions, "session")} of {TRAJECTORIES} \
-trajectories of {STEPS} pairs; reports and calibrated scores are the same for every method.
+    return f"""An expert acts optimally; every pair of its trajectories is observed, some of them wrongly. \
+The learner does not know the errors or their frequency. There {"is" if study.replications == 1 else "are"} \
+{counted(study.replications, "independent replication")} of {counted(study.sessions, "session")} \
+of {TRAJECTORIES} trajectories of {STEPS} pairs; observations and calibrated scores are the same for \
+every method.
 
-{bare}The sensor is judged by agreement probabilities: how often a predicate of a report is that of the \
-truth. The reliabilities that parametrise the sensor are no frequencies. Controls: the constant one half; \
-reports compared with what happened (oracle); reports taken for truths (observed, RIFOM); the program as \
-printed (all).
+{bare}The sensor is judged by agreement probabilities: how often a predicate of an observation is that of \
+the truth. The reliabilities that parametrise the sensor are not frequencies. Controls: the constant one \
+half; observations compared with the truth (oracle); observations taken for truths (observed, RIFOM); the \
+program as printed (all).
 
-{CLEAR!r} learns from what happened. Methods that know the sensor or need none have the same ridge and \
-number of iterations as RIMEO; those online remember all sessions alike.{natural}"""
+{CLEAR!r} learns from the truth. Methods with a known sensor or without one have the same ridge and \
+number of iterations as RIMEO; online methods weigh all sessions equally.{natural}"""
 
 
 def _doubts(study: NoisyStudy) -> str:
     lines = [
         f"{method}: the sensor is {'' if _identified(study, method) else 'not '}identified "
-        f"(in {doubt.known:.0%} of runs all predicates are)."
+        f"(in {doubt.known:.0%} of replications all predicates are)."
         for method, doubt in study.doubt.items()
     ]
     return " ".join(lines)
@@ -333,8 +363,9 @@ def _lead(study: NoisyStudy) -> Lead:
     result, early = study.results[PLAIN], min(EARLY, study.sessions)
     final = float(result.accuracy[:, -1, 0].mean())
     learned = (
-        f"From {counted(study.sessions, 'session')} of {TRAJECTORIES} misreported trajectories each, RIMEO "
-        f"learned a reward whose policy does as the expert in {number(100 * final)} % of the states, and at "
+        f"From {counted(study.sessions, 'session')} of {TRAJECTORIES} noisy trajectories each, RIMEO "
+        f"learned a reward whose policy agrees with the expert in {number(100 * final)} % of the "
+        f"states, and at "
         "the same time how often perception is right."
     )
     reach = float(np.mean(study.chance >= final - 1e-9))
@@ -342,21 +373,28 @@ def _lead(study: NoisyStudy) -> Lead:
         f"{number(100 * reach, 2)} % of random weights reach that accuracy, half of them "
         f"{number(100 * float(np.median(study.chance)))} %"
     )
-    runs = "one run shows no spread" if study.runs == 1 else f"a mean of {counted(study.runs, 'run')}"
+    replications = (
+        "one replication shows no spread"
+        if study.replications == 1
+        else f"a mean of {counted(study.replications, 'replication')}"
+    )
     sensor = (
-        "and the sensor, which these reports identify"
+        "and the sensor, which these observations identify"
         if _quotable(study, PLAIN)
-        else "but not the sensor, whose errors these reports do not tell from the expert's"
+        else "but not the sensor, whose errors these observations do not separate from the expert's"
     )
     verdict = "Trust the policy" if reach <= 0.05 else "Do not take the accuracy for evidence"
-    trust = f"{verdict} ({chance}; {runs}), {sensor}."
+    trust = f"{verdict} ({chance}; {replications}), {sensor}."
     rows = [
         (
-            row["feature"], round(row["learned"], 12), row["posterior median"],
-            f"{number(row['95 % interval'][0])} to {number(row['95 % interval'][1])}", float(true),
+            row["feature"],
+            round(row["learned"], 12),
+            row["posterior median"],
+            f"{number(row['95 % interval'][0])} to {number(row['95 % interval'][1])}",
+            float(true),
         )
         for row, true in zip(_reward(study) or [], study.task.weights, strict=False)
-    ]  # fmt: skip
+    ]
     if not rows:
         plain_rows = [
             (name, round(float(weight), 12), float(true))
@@ -364,12 +402,12 @@ def _lead(study: NoisyStudy) -> Lead:
                 study.task.mdp.feature_names, result.weights[0, -1], study.task.weights, strict=True
             )
         ]
-        told = "Weights of the first run after its last session, without intervals: no posterior was drawn."
+        told = "Weights of the first replication after its last session, without intervals or a posterior."
         return Lead(learned, trust, [Table(("feature", "weight", "true weight"), plain_rows, told)])
     table = Table(
         ("feature", f"weight, {PLAIN}", "posterior median", "95 % interval", "true weight"),
         rows,
-        f"Weights of the first run after its last session, and the posterior (NUTS) of its first "
+        f"Weights of the first replication after its last session, and the posterior (NUTS) of its first "
         f"{counted(early, 'session')}. A reward is known up to its length.",
     )
     return Lead(learned, trust, [table])
@@ -378,54 +416,65 @@ def _lead(study: NoisyStudy) -> Lead:
 def write(study: NoisyStudy, folder: Path | str) -> Path:
     """Write the page: ``index.html``, the pictures in both themes, and ``results.json``."""
     divergence = drawn(
-        folder, "divergence", partial(figures.divergence_plot, study),
-        "How far the learned sensor is from the true one (Figures 7.9 and 7.10).",
+        folder,
+        "divergence",
+        partial(figures.divergence_plot, study),
+        "Distance of the learned sensor from the true one (Figures 7.9 and 7.10).",
         "Divergence of agreement probabilities against sessions, logarithmic, RIMEO and controls",
-    )  # fmt: skip
+    )
     accuracy = drawn(
-        folder, "accuracy", partial(figures.accuracy_plot, study),
+        folder,
+        "accuracy",
+        partial(figures.accuracy_plot, study),
         "Learned behaviour accuracy. The axis does not begin at zero.",
-        "Learned behaviour accuracy against sessions for RIMEO, RIFOM and learners that know the sensor",
-    )  # fmt: skip
+        "Learned behaviour accuracy against sessions for RIMEO, RIFOM and learners with a known sensor",
+    )
     strip = drawn(
-        folder, "strip", partial(figures.strip_plot, study.strip, study.task.mdp),
-        f"A new trajectory as the first run's learner ({PLAIN}) understands it after its last session. Pairs "
+        folder,
+        "strip",
+        partial(figures.strip_plot, study.strip, study.task.mdp),
+        f"A new trajectory completed by the first replication's learner ({PLAIN}) after its last "
+        f"session. Pairs "
         "that are never likely are left out.",
-        "Grid of pairs against steps shaded by posterior probability, with what was seen and what happened",
-    )  # fmt: skip
+        "Grid of pairs against steps shaded by posterior probability, with the observations and the truth",
+    )
     sections = [
         Section("The sensor", _text(study), [sensor_table(study)], [divergence]),
         Section("The expert's errors, or the sensor's?", _doubts(study), [doubt_table(study)]),
         Section("Behaviour", "", [behaviour_table(study)], [accuracy]),
     ]
     if study.hidden is not None:
-        text = "The view is the patrol study's: a mask of states. What is seen in it may be misreported."
-        sections.append(Section("Out of view, and misreported", text, [hidden_table(study)]))
+        text = "The view is the patrol study's: a mask of states. Observations of states in view may err."
+        sections.append(Section("Hidden and noisy", text, [hidden_table(study)]))
     believed = study.strip.believed
     told = (
-        "No report of this trajectory is wrong."
+        "Every observation of this trajectory is right."
         if math.isnan(believed)
-        else f"Where a report is wrong, what happened has posterior probability {believed:.2f} on average."
+        else f"At wrong observations the truth has posterior probability {believed:.2f} on average."
     )
     pictures = [strip]
     if study.posterior is not None:
         sensor = drawn(
-            folder, "sensor", partial(figures.sensor_plot, study.posterior),
+            folder,
+            "sensor",
+            partial(figures.sensor_plot, study.posterior),
             "Joint posterior over reward and reliabilities (NUTS), as agreement probabilities, beside "
             "RIMEO's estimate from the same trajectories.",
             "Posterior intervals of each feature's agreement probability with the truth marked",
-        )  # fmt: skip
+        )
         pictures.insert(0, sensor)
     sections.append(Section("What one learner believes", told, [], pictures))
     if study.belts is not None:
         belts = drawn(
-            folder, "belts",
+            folder,
+            "belts",
             partial(_draw_belts, study.belts),
             "What the learned policies do on simulated belts, beside the dissertation's belt (Figure 7.9).",
             "Precision and recall of the expert and of each method, with intervals",
-        )  # fmt: skip
+        )
         text = (
-            "A policy that errs in a single state on the way may stop sorting altogether: runs sort about as "
+            "A policy that errs in a single state on the way may stop sorting altogether: "
+            "replications sort about as "
             "the expert does, or hardly at all, and a mean over them is like neither."
         )
         sections.append(Section("Sorting", text, [belts_table(study)], [belts]))

@@ -1,8 +1,8 @@
-"""Learning through noisy perception, measured (section 7.4.3): the sensor that is learned, and the behaviour.
+"""Study of learning through noisy perception (section 7.4.3): the learned sensor and behaviour.
 
-Every method learns from the same simulated reports, many streams of them; learners that compile run all their
-streams in one program. The sensor is judged by agreement probabilities, the behaviour by learned behaviour
-accuracy (LBA).
+Every method learns from the same simulated observations, many streams of them; learners that compile run all
+their streams in one program. The sensor is judged by agreement probabilities, the behaviour by learned
+behaviour accuracy (LBA).
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ from .examples import BELTS, SensorPosterior, Strip, sensor_posterior, sorted_be
 Advance = Callable[[str, float | None], None]
 TASKS: Mapping[str, Callable[[], NoisyTask]] = {"sorting": noisy_sorting, "patrol": noisy_patrol}
 TRAJECTORIES, STEPS = 2, 3
-# Where most states are hidden, three steps from anywhere are mostly unseen.
+# With most states hidden, three steps from anywhere are mostly hidden.
 HIDDEN_STEPS = 10
 OBSERVABILITY = 30
 # Methods that do not compile, or learn once from everything, get so many of the streams.
@@ -82,23 +82,23 @@ def divergence(
 
 
 class MeanInterval(NamedTuple):
-    """A mean over runs and its 95 % interval."""
+    """A mean over replications and its 95 % interval."""
 
     mean: Float[np.ndarray, "..."]
     low: Float[np.ndarray, "..."]
     high: Float[np.ndarray, "..."]
 
 
-def mean_interval(runs: Float[np.ndarray, "runs ..."]) -> MeanInterval:
+def mean_interval(replications: Float[np.ndarray, "replications ..."]) -> MeanInterval:
     """Mean over the first axis, with the normal distribution's interval; NaN at its ends for one run."""
-    runs = np.asarray(runs, float)
-    mean, n = runs.mean(0), len(runs)
-    half = 1.96 * runs.std(0, ddof=1) / np.sqrt(n) if n > 1 else np.full_like(mean, np.nan)
+    replications = np.asarray(replications, float)
+    mean, n = replications.mean(0), len(replications)
+    half = 1.96 * replications.std(0, ddof=1) / np.sqrt(n) if n > 1 else np.full_like(mean, np.nan)
     return MeanInterval(mean, mean - half, mean + half)
 
 
 class Streams(NamedTuple):
-    """What learners get: ``seen`` and ``truth`` with arrays ``[runs, sessions, trajectories, steps]``.
+    """Learners' data: ``seen`` and ``truth`` with arrays ``[replications, sessions, trajectories, steps]``.
 
     ``mdp`` is the process with the start that was simulated.
     """
@@ -112,7 +112,7 @@ class Streams(NamedTuple):
         return Demonstration(*(np.asarray(x)[run, session] for x in getattr(self, of).arrays))
 
     def whole(self, run: int, of: str = "seen") -> Demonstration:
-        """All trajectories of a run."""
+        """Return all trajectories of a replication."""
         arrays = getattr(self, of).arrays
         return Demonstration(*(np.asarray(x)[run].reshape(-1, x.shape[-1]) for x in arrays))
 
@@ -121,22 +121,29 @@ def draw_streams(
     key: Array,
     task: NoisyTask,
     *,
-    runs: int,
+    replications: int,
     sessions: int,
     starts: Starts = "all",
     steps: int = STEPS,
     noise: AnySensor | None = None,
-    view: Visibility | None = None,
+    visibility: Visibility | None = None,
 ) -> Streams:
     """Independent streams with calibrated scores, all trajectories drawn in one go.
 
     Raises ``ValueError`` as :func:`demonstrate_noisy` does.
     """
     drawn = demonstrate_noisy(
-        key, task, noise, sessions=runs * sessions, trajectories=TRAJECTORIES, steps=steps, starts=starts,
-        scores="calibrated", view=view,
-    )  # fmt: skip
-    shape = (runs, sessions, TRAJECTORIES, steps)
+        key,
+        task,
+        noise,
+        sessions=replications * sessions,
+        trajectories=TRAJECTORIES,
+        steps=steps,
+        starts=starts,
+        scores="calibrated",
+        visibility=visibility,
+    )
+    shape = (replications, sessions, TRAJECTORIES, steps)
     seen, truth = (
         Demonstration(*(np.asarray(x).reshape(shape) for x in d.arrays)) for d in (drawn.seen, drawn.truth)
     )
@@ -144,50 +151,51 @@ def draw_streams(
 
 
 class MethodResult(NamedTuple):
-    """One method on its streams.
+    """Result of one method on its streams.
 
     Fields
     ------
     name : str
     sessions : int ``[T]``
-        After which it was measured.
-    weights : float ``[runs, T, K]``
-    agreement : float ``[runs, T, J]`` or None
-        Learned agreement probabilities of what the learner knows, the task's predicates first.
-    divergence : float ``[runs, T]`` or None
-        Of the predicates' from the true ones, mean over predicates, in nats.
-    accuracy : float ``[runs, T, 3]``
+        Sessions after which it was measured.
+    weights : float ``[replications, T, K]``
+    agreement : float ``[replications, T, J]`` or None
+        Learned agreement probabilities of the learner's predicates, the task's first.
+    divergence : float ``[replications, T]`` or None
+        Divergence from the true probabilities, mean over predicates, in nats.
+    accuracy : float ``[replications, T, 3]``
         LBA over :data:`STATES`.
     state
-        The learner's final states (leading axis: runs), None for those that have none.
+        The learner's final states (leading axis: replications), None for those that have none.
     """
 
     name: str
     sessions: Int[np.ndarray, " T"]
-    weights: Float[np.ndarray, "runs T K"]
-    agreement: Float[np.ndarray, "runs T J"] | None
-    divergence: Float[np.ndarray, "runs T"] | None
-    accuracy: Float[np.ndarray, "runs T 3"]
+    weights: Float[np.ndarray, "replications T K"]
+    agreement: Float[np.ndarray, "replications T J"] | None
+    divergence: Float[np.ndarray, "replications T"] | None
+    accuracy: Float[np.ndarray, "replications T 3"]
     state: Any = None
 
 
 class SensorDoubt(NamedTuple):
-    """Whether the learned sensors are known, by run: see :mod:`i2rl.inference.learners.identification`.
+    """Identification of the learned sensors, by replication: see
+    :mod:`i2rl.inference.learners.identification`.
 
     Fields
     ------
-    erratic, decided : float ``[runs, J]``
+    erratic, optimal : float ``[replications, J]``
         Agreement of the task's predicates, by what is assumed of the expert.
-    identified : bool ``[runs, J]``
+    identified : bool ``[replications, J]``
     """
 
-    erratic: Float[np.ndarray, "runs J"]
-    decided: Float[np.ndarray, "runs J"]
-    identified: Bool[np.ndarray, "runs J"]
+    erratic: Float[np.ndarray, "replications J"]
+    optimal: Float[np.ndarray, "replications J"]
+    identified: Bool[np.ndarray, "replications J"]
 
     @property
     def known(self) -> float:
-        """Share of runs in which all predicates are identified."""
+        """Share of replications in which all predicates are identified."""
         return float(self.identified.all(1).mean())
 
 
@@ -197,7 +205,7 @@ class NoisyStudy(NamedTuple):
     Fields
     ------
     task : NoisyTask
-    starts, runs, sessions, seed
+    starts, replications, sessions, seed
     streams : Streams
     true_agreement : float ``[J]``
         Of the task's predicates, among the expert's pairs.
@@ -222,7 +230,7 @@ class NoisyStudy(NamedTuple):
 
     task: NoisyTask
     starts: Starts
-    runs: int
+    replications: int
     sessions: int
     seed: int
     streams: Streams
@@ -247,7 +255,7 @@ class NoisyStudy(NamedTuple):
 
 
 class _Entry(NamedTuple):
-    """How a learner is made, what it is fed, and whether it estimates agreement."""
+    """Learner of a study, its input, and whether it estimates agreement."""
 
     learner: Callable[[TabularMDP, NoisyTask], Learner]
     fed: str = "seen"
@@ -276,7 +284,7 @@ METHODS = (*LEARNERS, ROBUST, MLIRL)
 
 
 class _Judge(NamedTuple):
-    """What learned agreement and weights are compared with."""
+    """Truth with which learned agreement and weights are compared."""
 
     task: NoisyTask
     true_agreement: Float[np.ndarray, " J"]
@@ -303,27 +311,27 @@ class _Judge(NamedTuple):
     def online(
         self, name: str, key: Array, learner: Learner, streams: Streams, entry: _Entry
     ) -> MethodResult:
-        """A learner on all streams."""
+        """Run a learner on all streams."""
         weights, agreement, state = _learned(key, learner, streams, entry)
         return self.result(name, np.arange(1, streams.seen.kind.shape[1] + 1), weights, agreement, state)
 
     def batch(self, name: str, key: Array, streams: Streams) -> MethodResult:
-        """A learner that is given all of a stream at once, on a few streams."""
-        runs, sessions = streams.seen.kind.shape[:2]
+        """Run a learner on all sessions of a stream at once, on a few streams."""
+        replications, sessions = streams.seen.kind.shape[:2]
         robust = robust_irl(streams.mdp, self.task.noise, slack=0.0, ridge=DEFAULT_RIDGE)
         weights = []
-        for run in range(min(runs, FEW)):
-            reports, own = streams.whole(run), jax.random.fold_in(key, run)
+        for run in range(min(replications, FEW)):
+            observations, own = streams.whole(run), jax.random.fold_in(key, run)
             if name == ROBUST:
-                weights.append(robust.fit(own, reports).weights)
+                weights.append(robust.fit(own, observations).weights)
             else:
-                weights.append(mlirl(own, *taken_at_face_value(streams.mdp, reports)).weights)
+                weights.append(mlirl(own, *taken_at_face_value(streams.mdp, observations)).weights)
         return self.result(name, np.array([sessions]), np.array(weights)[:, None])
 
 
 @jax.jit
 def _hits(mdp: TabularMDP, optimal: Bool[Array, "S A"], weights: Float[Array, "N K"]) -> Float[Array, "N S"]:
-    """Where the greedy policy of each weights does what an expert does."""
+    """Test at which states the greedy policy of each weights agrees with the expert."""
 
     def one(w: Float[Array, " K"]) -> Float[Array, " S"]:
         policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, w)).optimal)
@@ -334,16 +342,19 @@ def _hits(mdp: TabularMDP, optimal: Bool[Array, "S A"], weights: Float[Array, "N
 
 
 def _judged_states(task: NoisyTask) -> Bool[np.ndarray, "3 S"]:
-    """All states, those with a choice, and those that can be reached from where the task naturally starts."""
+    """Return all states, those with a choice, and those reachable from the task's natural start."""
     available = np.asarray(task.mdp.available)
     return np.stack([np.ones(len(available), bool), available.sum(1) > 1, reachable_states(task.mdp)])
 
 
 def _learned(key: Array, learner: Learner, streams: Streams, entry: _Entry) -> tuple:
     """Weights and agreement after every session, and the final states."""
-    runs = len(streams.seen.kind)
+    replications = len(streams.seen.kind)
     if learner.session is None:
-        kept = [_one_by_one(jax.random.fold_in(key, r), learner, streams, r) for r in range(min(runs, FEW))]
+        kept = [
+            _one_by_one(jax.random.fold_in(key, r), learner, streams, r)
+            for r in range(min(replications, FEW))
+        ]
         weights, agreement = (np.array(x) for x in zip(*kept, strict=True))
         return weights, agreement, None
     fed = {
@@ -362,18 +373,18 @@ def _kept(perceives: bool, state: Any, report: Any) -> tuple:
 
 def _one_by_one(key: Array, learner: Learner, streams: Streams, run: int) -> tuple:
     sessions = streams.seen.kind.shape[1]
-    reports: Any = run_sessions(learner, (streams.session(run, t) for t in range(sessions)), key=key).infos
-    return [report.weights for report in reports], [report.agreement for report in reports]
+    infos: Any = run_sessions(learner, (streams.session(run, t) for t in range(sessions)), key=key).infos
+    return [info.weights for info in infos], [info.agreement for info in infos]
 
 
-def taken_at_face_value(mdp: TabularMDP, reports: Demonstration) -> tuple[TabularMDP, Demonstration]:
-    """Reports as what they say, for a learner that knows no noise: each pair by itself, anywhere.
+def taken_at_face_value(mdp: TabularMDP, observations: Demonstration) -> tuple[TabularMDP, Demonstration]:
+    """Take observations for truths, for a learner without a noise model: each pair by itself, anywhere.
 
-    Wrong reports follow one another as no process could, so transitions say nothing; pairs that are not
-    offered at all are dropped.
+    Wrong observations follow one another as no process could, so transitions carry no information;
+    unavailable pairs are dropped.
     """
-    seen = np.asarray(reports.kind) == SEEN
-    states, actions = np.asarray(reports.state)[seen], np.asarray(reports.action)[seen]
+    seen = np.asarray(observations.kind) == SEEN
+    states, actions = np.asarray(observations.state)[seen], np.asarray(observations.action)[seen]
     offered = np.asarray(mdp.available)[states, actions]
     anywhere = mdp.with_initial(jnp.full(mdp.n_states, 1 / mdp.n_states))
     return anywhere, Demonstration.from_pairs(states[offered, None], actions[offered, None])
@@ -385,11 +396,11 @@ def _doubted(task: NoisyTask, streams: Streams, result: MethodResult, scores: st
         identify(streams.whole(run), result.weights[run, -1]) for run in range(min(len(result.weights), FEW))
     ]
     n_predicates = len(task.predicates)
-    erratic, decided, identified = (
+    erratic, optimal, identified = (
         np.array([getattr(x, name)[:n_predicates] for x in found])
         for name in ("erratic", "decided", "identified")
     )
-    return SensorDoubt(erratic, decided, identified)
+    return SensorDoubt(erratic, optimal, identified)
 
 
 # -- the study ----------------------------------------------------------------------------------------
@@ -398,7 +409,7 @@ def _doubted(task: NoisyTask, streams: Streams, result: MethodResult, scores: st
 def noisy_study(
     name: str,
     *,
-    runs: int = 50,
+    replications: int = 50,
     sessions: int = 20,
     starts: Starts = "all",
     seed: int = 0,
@@ -412,7 +423,7 @@ def noisy_study(
     Parameters
     ----------
     name : {"sorting", "patrol"}
-    runs, sessions : int
+    replications, sessions : int
         Independent streams, and sessions of each: two trajectories of three pairs. Learners in batch, and
         those outside JAX, get the first :data:`FEW` streams.
     starts : {"all", "natural"}
@@ -432,7 +443,7 @@ def noisy_study(
     """
     if name not in TASKS:
         raise ValueError(f"tasks are {', '.join(TASKS)}; got {name!r}")
-    for what, number in (("runs", runs), ("sessions", sessions), ("belts", belts)):
+    for what, number in (("replications", replications), ("sessions", sessions), ("belts", belts)):
         if number < 1:
             raise ValueError(f"{what} must be at least 1, got {number}")
     if draws < 0:
@@ -443,7 +454,7 @@ def noisy_study(
     task = TASKS[name]()
     chosen = [m for m in METHODS if methods is None or m in methods or m == PLAIN]
     draw, learn, hide, show = jax.random.split(jax.random.key(seed), 4)
-    streams = draw_streams(draw, task, runs=runs, sessions=sessions, starts=starts)
+    streams = draw_streams(draw, task, replications=replications, sessions=sessions, starts=starts)
     pairs = task.pair_distribution(starts, STEPS)
     judge = _Judge(task, agreement_probabilities(task.noise, task.predicates, pairs), _judged_states(task))
     results = {}
@@ -458,19 +469,32 @@ def noisy_study(
     seconds = _seconds([method for method in TIMED if method in results], task, streams)
     doubt = {m: _doubted(task, streams, results[m], scores) for m, scores in DOUBTED.items() if m in results}
     advance("out of view", (len(chosen) + 1) / (len(chosen) + 3))
-    hidden = _hidden(hide, judge, runs, sessions, starts) if name == "patrol" else None
+    hidden = _hidden(hide, judge, replications, sessions, starts) if name == "patrol" else None
     advance("examples", (len(chosen) + 2) / (len(chosen) + 3))
     posterior, happened, sorted_ = _examples(show, judge, streams, results, starts, pairs, belts, draws)
     advance("done", 1.0)
     return NoisyStudy(
-        task, starts, runs, sessions, seed, streams, judge.true_agreement, judge.states, results, seconds,
-        doubt, hidden, posterior, happened, sorted_,
+        task,
+        starts,
+        replications,
+        sessions,
+        seed,
+        streams,
+        judge.true_agreement,
+        judge.states,
+        results,
+        seconds,
+        doubt,
+        hidden,
+        posterior,
+        happened,
+        sorted_,
         chance_accuracy(jax.random.fold_in(show, 200), task.mdp, jnp.asarray(task.weights)),
-    )  # fmt: skip
+    )
 
 
 def _seconds(methods: Sequence[str], task: NoisyTask, streams: Streams) -> dict[str, float]:
-    """Of the first stream, gone through twice: compiled in one pass, timed in the other.
+    """Time the first stream, learned twice: the first time compiles.
 
     Learners take turns, so that whatever else the machine does slows all of them alike.
     """
@@ -486,7 +510,9 @@ def _seconds(methods: Sequence[str], task: NoisyTask, streams: Streams) -> dict[
     return {method: float(np.median(seconds)) for method, seconds in zip(methods, taken, strict=True)}
 
 
-def _hidden(key: Array, judge: _Judge, runs: int, sessions: int, starts: Starts) -> dict[str, MethodResult]:
+def _hidden(
+    key: Array, judge: _Judge, replications: int, sessions: int, starts: Starts
+) -> dict[str, MethodResult]:
     """Most states out of view: without noise, and with noise that is learned; the same paths are walked."""
     view = instance(2).visibility(OBSERVABILITY)
     draw, learn = jax.random.split(key)
@@ -496,9 +522,15 @@ def _hidden(key: Array, judge: _Judge, runs: int, sessions: int, starts: Starts)
     results = {}
     for method, noise, entry in ((HIDDEN, noisy_patrol(0.0).noise, clear), (BOTH, judge.task.noise, noisy)):
         streams = draw_streams(
-            draw, judge.task, runs=runs, sessions=sessions, starts=starts, steps=HIDDEN_STEPS, noise=noise,
-            view=view,
-        )  # fmt: skip
+            draw,
+            judge.task,
+            replications=replications,
+            sessions=sessions,
+            starts=starts,
+            steps=HIDDEN_STEPS,
+            noise=noise,
+            visibility=view,
+        )
         learner = entry.learner(streams.mdp, judge.task)
         results[method] = judge.online(method, learn, learner, streams, entry)
     return results
@@ -514,7 +546,7 @@ def _examples(
     belts: int,
     draws: int,
 ) -> tuple[SensorPosterior | None, Strip, SortingTable | None]:
-    """Of the first stream: its early sessions' posterior, and a new trajectory as it is understood."""
+    """Return the posterior of the first stream's early sessions, and the completion of a new trajectory."""
     learned, early = results[PLAIN], min(EARLY, streams.seen.kind.shape[1])
     assert learned.agreement is not None
     sample, walk, belt = jax.random.split(key, 3)

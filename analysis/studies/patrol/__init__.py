@@ -1,4 +1,4 @@
-"""Learn a patrol's rewards online through a keyhole, and walk past the patrollers unseen.
+"""Study of a patrol: learn its rewards online through a keyhole, and walk past the patrollers undetected.
 
 Imports the rooms of judging, drawing, bounds and posteriors.
 """

@@ -1,4 +1,4 @@
-"""The main job: learn a patrol's rewards online through a keyhole, and walk past the patrollers unseen."""
+"""Main study: learn a patrol's rewards online through a keyhole, and walk past the patrollers undetected."""
 
 from __future__ import annotations
 
@@ -44,8 +44,12 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 ONLINE, FORGETFUL, BATCH, RANDOM, TRUE = (
-    "LME-I2RL", "LME-I2RL with random weights", "batch LME", "random weights", "true policy",
-)  # fmt: skip
+    "LME-I2RL",
+    "LME-I2RL with random weights",
+    "batch LME",
+    "random weights",
+    "true policy",
+)
 # Names on the command line.
 METHODS = {"lme-i2rl": ONLINE, "batch": BATCH, "random": RANDOM}
 STEPS_PER_SESSION = 5
@@ -58,24 +62,24 @@ Advance = Callable[[str, float | None], None]
 
 
 class MethodResult(NamedTuple):
-    """What a method reached; the first axis runs over independent runs and the patrollers of each.
+    """Results of a method; the first axis ranges over independent replications and the patrollers of each.
 
     Fields
     ------
     name : str
     points : int ``[T]``
         Sessions at which the rest was measured.
-    weights : float ``[runs, patrollers, T, K]``
-    accuracy, choice_accuracy : float ``[runs * patrollers, T]``
+    weights : float ``[replications, patrollers, T, K]``
+    accuracy, choice_accuracy : float ``[replications * patrollers, T]``
         LBA over all states and over states with a choice.
-    error : float ``[runs * patrollers, T]``
+    error : float ``[replications * patrollers, T]``
         ILE relative to the value of the optimal policy.
-    log_likelihood : float ``[runs * patrollers, T]``
-        Exact, of fresh demonstrations that nobody learned from; nats per trajectory.
-    seconds : float ``[runs, T]``
+    log_likelihood : float ``[replications * patrollers, T]``
+        Exact, of fresh demonstrations; nats per trajectory.
+    seconds : float ``[replications, T]``
         Learning time up to there, all patrollers together.
     breach : BreachOutcome or None
-        All runs' trials together.
+        All replications' trials together.
     """
 
     name: str
@@ -90,13 +94,13 @@ class MethodResult(NamedTuple):
 
 
 class Study(NamedTuple):
-    """A study of one patrol: settings, the methods' results, and one stretch the first learner looked at."""
+    """Study of one patrol: settings, the methods' results, and one stretch observed by the first learner."""
 
     patrol: Patrol
     observability: int
     sessions: int
     trials: int
-    runs: int
+    replications: int
     seed: int
     methods: tuple[MethodResult, ...]
     batch_rerun_seconds: np.ndarray | None
@@ -146,15 +150,15 @@ def patrol_study(
     *,
     sessions: int = 60,
     trials: int = 200,
-    runs: int = 3,
+    replications: int = 3,
     seed: int = 0,
     methods: Sequence[str] | None = None,
     advance: Advance = lambda description, fraction: None,
 ) -> Study:
     """Learn, evaluate and (instances 2 and 3) breach.
 
-    ``runs`` independent demonstrations are learned from, one learner per patroller; each learned set of
-    policies then tries ``trials`` breaches, with the time it took to learn on the clock. ``methods`` names
+    ``replications`` independent demonstrations are learned from, one learner per patroller; each learned set
+    of policies then tries ``trials`` breaches, with the time it took to learn on the clock. ``methods`` names
     some of ``lme-i2rl``, ``batch`` and ``random`` (all by default). Raises ``ValueError`` for an instance,
     observability or method that does not exist.
     """
@@ -165,7 +169,7 @@ def patrol_study(
     if unknown:
         raise ValueError(f"method must be one of {', '.join(METHODS)}, got {unknown[0]!r}")
     wanted = {METHODS[m] for m in methods} if methods else {ONLINE, FORGETFUL, BATCH, RANDOM}
-    keys = jax.random.split(jax.random.key(seed), runs)
+    keys = jax.random.split(jax.random.key(seed), replications)
     data = [demonstrate(k, patrol, observability, sessions, STEPS_PER_SESSION) for k in keys]
     learners = {
         ONLINE: partial(_online, lme_i2rl(patrol.mdp, view)),
@@ -201,13 +205,24 @@ def patrol_study(
     )
     advance("done", 1.0)
     return Study(
-        patrol, observability, sessions, trials, runs, seed, tuple(results), rerun, stretch, determined,
-        chance, truth,
-    )  # fmt: skip
+        patrol,
+        observability,
+        sessions,
+        trials,
+        replications,
+        seed,
+        tuple(results),
+        rerun,
+        stretch,
+        determined,
+        chance,
+        truth,
+    )
 
 
 class _Learned(NamedTuple):
-    """One run of one method: sessions ``[T]``, ``weights [P, T, K]``, cumulative seconds ``[T]``."""
+    """Results of one replication of one method: sessions ``[T]``, ``weights [P, T, K]``, cumulative "
+    "seconds ``[T]``."""
 
     points: np.ndarray
     weights: np.ndarray
@@ -217,12 +232,12 @@ class _Learned(NamedTuple):
 def _online(learner: Learner, key: jax.Array, demonstrations: Sequence[Demonstration]) -> _Learned:
     # One session first, unrecorded, so that compilation is not counted as learning.
     learner.update(learner.init(key), demonstrations[0].select([0]))
-    runs = [
+    replications = [
         run_sessions(learner, d.sessions(), key=jax.random.fold_in(key, p)).infos
         for p, d in enumerate(demonstrations)
     ]
-    weights = np.array([[r.weights for r in reports] for reports in runs])
-    seconds = np.cumsum(np.sum([[r.seconds for r in reports] for reports in runs], axis=0))
+    weights = np.array([[r.weights for r in reports] for reports in replications])
+    seconds = np.cumsum(np.sum([[r.seconds for r in reports] for reports in replications], axis=0))
     return _Learned(np.arange(1, weights.shape[1] + 1), weights, seconds)
 
 
@@ -251,13 +266,14 @@ def _random(patrol: Patrol, key: jax.Array, demonstrations: Sequence[Demonstrati
 def _likelihoods(
     patrol: Patrol, observability: int, weights: Float[np.ndarray, "n K"]
 ) -> Float[np.ndarray, " n"]:
-    """Nats per trajectory of fresh demonstrations, the same for everybody and learned from by nobody."""
+    """Compute nats per trajectory of fresh demonstrations, the same for all methods."""
     fresh = concatenate(demonstrate(jax.random.key(10**6), patrol, observability, 60, STEPS_PER_SESSION))
     view = patrol.visibility(observability)
     likelihood = lax.map(
         lambda w: jnp.mean(demonstration_log_likelihoods(patrol.mdp, view, w, fresh)),
-        jnp.asarray(weights), batch_size=16,
-    )  # fmt: skip
+        jnp.asarray(weights),
+        batch_size=16,
+    )
     return np.asarray(likelihood)
 
 
@@ -287,31 +303,42 @@ def _evaluated(
     trials: int,
 ) -> MethodResult:
     weights = np.stack([one.weights for one in learned])
-    runs, patrollers, n, k = weights.shape
+    replications, patrollers, n, k = weights.shape
     scores = jax.vmap(partial(evaluate, patrol.mdp, jnp.asarray(patrol.weights)))(
         jnp.asarray(weights).reshape(-1, k)
     )
-    shape = (runs * patrollers, n)
+    shape = (replications * patrollers, n)
     likelihood = _likelihoods(patrol, observability, weights.reshape(-1, k))
     breach = None
     if patrol.breach is not None:
         outcomes = [
             breach_trials(
-                jax.random.fold_in(key, 99), patrol, greedy_policies(patrol, weights[i, :, -1]),
-                observability=observability, observed_steps=sessions * STEPS_PER_SESSION, trials=trials,
+                jax.random.fold_in(key, 99),
+                patrol,
+                greedy_policies(patrol, weights[i, :, -1]),
+                observability=observability,
+                observed_steps=sessions * STEPS_PER_SESSION,
+                trials=trials,
                 learning_seconds=float(learned[i].seconds[-1]),
             )
             for i, key in enumerate(keys)
-        ]  # fmt: skip
+        ]
         breach = BreachOutcome(
-            np.concatenate([o.ended for o in outcomes]), np.concatenate([o.waited for o in outcomes]),
+            np.concatenate([o.ended for o in outcomes]),
+            np.concatenate([o.waited for o in outcomes]),
             float(np.mean([o.threshold for o in outcomes])),
-        )  # fmt: skip
+        )
     return MethodResult(
-        name, learned[0].points, weights, np.asarray(scores.accuracy.overall).reshape(shape),
-        np.asarray(scores.accuracy.choice).reshape(shape), np.asarray(scores.error.relative).reshape(shape),
-        likelihood.reshape(shape), np.stack([one.seconds for one in learned]), breach,
-    )  # fmt: skip
+        name,
+        learned[0].points,
+        weights,
+        np.asarray(scores.accuracy.overall).reshape(shape),
+        np.asarray(scores.accuracy.choice).reshape(shape),
+        np.asarray(scores.error.relative).reshape(shape),
+        likelihood.reshape(shape),
+        np.stack([one.seconds for one in learned]),
+        breach,
+    )
 
 
 def _stretch(key: jax.Array, patrol: Patrol, observability: int, weights: np.ndarray) -> Stretch:
@@ -358,29 +385,31 @@ def _rows(study: Study) -> list[dict[str, Any]]:
 
 
 def summary(study: Study) -> dict[str, Any]:
-    """The study's settings and results as plain data."""
+    """Return the study's settings and results as plain data."""
     reward: dict[str, Any] = {
         "features": list(study.patrol.mdp.feature_names),
         "true weights": study.patrol.weights,
-        "learned, first run": [
+        "learned, first replication": [
             {"patroller": who, "method": study.methods[0].name, "weights": found.estimates.summary()}
             for who, found in _by_patroller(study).items()
         ],
-        "by method, run and patroller": {m.name: m.weights[:, :, -1] for m in study.methods},
+        "by method, replication and patroller": {m.name: m.weights[:, :, -1] for m in study.methods},
     }
-    told: dict[str, Any] = plain({
-        "provenance": study_provenance(study.seed),
-        "patrol": study.patrol.name,
-        "observability": study.observability,
-        "sessions": study.sessions,
-        "trials": study.trials,
-        "runs": study.runs,
-        "seed": study.seed,
-        "methods": _rows(study),
-        "reward": reward,
-        "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
-        "true weights": study.truth._asdict(),
-    })  # fmt: skip
+    told: dict[str, Any] = plain(
+        {
+            "provenance": study_provenance(study.seed),
+            "patrol": study.patrol.name,
+            "observability": study.observability,
+            "sessions": study.sessions,
+            "trials": study.trials,
+            "replications": study.replications,
+            "seed": study.seed,
+            "methods": _rows(study),
+            "reward": reward,
+            "random weights": {"draws": len(study.chance), "LBA": np.sort(study.chance)},
+            "true weights": study.truth._asdict(),
+        }
+    )
     return told
 
 
@@ -407,16 +436,24 @@ def _results_table(study: Study) -> Table:
         success = _percent(row["success"])
         if interval is not None:
             success += f" ({100 * interval[0]:.0f}-{100 * interval[1]:.0f})"
-        cells.append((
-            row["method"], _percent(row["LBA"]), _percent(row["LBA choice states"]), f"{row['ILE']:.4f}",
-            f"{row['log-likelihood']:.3f}", success, _percent(row["time-outs"]),
-            number(row["seconds per session"]),
-        ))  # fmt: skip
+        cells.append(
+            (
+                row["method"],
+                _percent(row["LBA"]),
+                _percent(row["LBA choice states"]),
+                f"{row['ILE']:.4f}",
+                f"{row['log-likelihood']:.3f}",
+                success,
+                _percent(row["time-outs"]),
+                number(row["seconds per session"]),
+            )
+        )
     return Table(_HEADINGS, cells, _CAPTION)
 
 
 _CAPTION = (
-    "Medians over runs and patrollers. ILE is relative to the optimal value. Nats: log-likelihood of fresh "
+    "Medians over replications and patrollers. ILE is relative to the optimal value. Nats: log-likelihood of "
+    "fresh "
     "demonstrations. Seconds: all patrollers together; for batch, those of one run over everything, spent "
     "again at each session."
 )
@@ -430,7 +467,7 @@ def print_tables(study: Study, console: Console) -> None:
 def _settings(study: Study) -> str:
     told = (
         f"{study.patrol.name}, {study.observability} % in view, {counted(study.sessions, 'session')} of "
-        f"{STEPS_PER_SESSION} steps, {counted(study.runs, 'run')}"
+        f"{STEPS_PER_SESSION} steps, {counted(study.replications, 'replication')}"
     )
     return told if study.patrol.breach is None else f"{told} of {counted(study.trials, 'breach')}"
 
@@ -449,13 +486,14 @@ def _lead(study: Study) -> Lead:
     first, row = study.methods[0], _rows(study)[0]
     if not study.determined:
         return Lead(
-            f"Nothing was learned here: {listed([m.name for m in study.methods])} were only measured.",
+            f"No learning here: {listed([m.name for m in study.methods])} were only measured.",
             "Trust the numbers as those of a control.",
         )
     whose = "the patroller's reward" if len(study.determined) == 1 else "the rewards of both patrollers"
     learned = (
         f"From {counted(study.sessions, 'session')} with {study.observability} % of {study.patrol.name} in "
-        f"view, {first.name} learned {whose}: the best policy of what was learned does as the expert in "
+        f"view, {first.name} learned {whose}: the optimal policy of the learned weights agrees with the "
+        "expert in "
         f"{number(100 * row['LBA'])} % of the states and loses {_lost(row['ILE'])} of the value."
     )
     vague = sum(len(found.directions) for found in study.determined)
@@ -468,14 +506,15 @@ def _lead(study: Study) -> Lead:
     )
     reach = _share_as_good(study)
     trust = (
-        f"That accuracy is no evidence, since {_percent(reach, 0)} of random weights reach it as well; "
+        f"That accuracy is weak evidence, since {_percent(reach, 0)} of random weights reach it as well; "
         "trust the likelihood of fresh demonstrations instead, "
         if reach > 0.05
         else f"Chance does not explain the accuracy, since {_percent(reach, 1)} of random weights reach it, "
     )
     tables = [
         found.estimates.table(
-            f"Weights of {who} that {first.name} learned in the first run. Intervals are those of the "
+            f"Weights of {who} that {first.name} learned in the first replication. Intervals are "
+            f"those of the "
             "likelihood's curvature there; a reward is known up to its length, hence the shares.",
             np.asarray(study.patrol.weights),
         )
@@ -502,13 +541,13 @@ def _text(study: Study) -> str:
 
 Chance: of {counted(len(study.chance), "weight vector")} drawn at random, half have an LBA of at least \
 {_percent(median)}, and {_percent(_share_as_good(study))} have the {_percent(float(reached))} of \
-{first.name} or more. The row of random weights is one such draw a patroller and run.
+{first.name} or more. The row of random weights is one draw a patroller and replication.
 
-Likelihood: it is that of a policy which errs the less the longer its weights are, and the patrollers never \
-err. The true weights are given in no such units. As given they reach {number(study.truth.as_given)} nats a \
+Likelihood: it is that of a policy that errs less for longer weights, and the patrollers never err. The true \
+weights have arbitrary units. As given they reach {number(study.truth.as_given)} nats a \
 trajectory, stretched {number(stretched)} times {number(best)}, and {first.name} {number(learned)}. Learned \
-weights maximise the likelihood of what was seen, their length included; the true weights maximise nothing, \
-so that a likelihood above theirs is no error."""
+weights maximise the likelihood of the observations, their length included; the true weights do not, so a \
+likelihood above theirs is consistent."""
 
 
 def write(study: Study, folder: Path | str) -> Path:
@@ -517,9 +556,15 @@ def write(study: Study, folder: Path | str) -> Path:
     policy = greedy_policies(study.patrol, first.weights[0, :1, -1])[0]
     pictures = [
         drawn(
-            folder, "policy", lambda theme: policy_map(
-                study.patrol.mdp, np.exp(np.asarray(policy)), study.patrol.layout,
-                weights=study.patrol.weights, in_view=study.patrol.views[study.observability], theme=theme,
+            folder,
+            "policy",
+            lambda theme: policy_map(
+                study.patrol.mdp,
+                np.exp(np.asarray(policy)),
+                study.patrol.layout,
+                weights=study.patrol.weights,
+                in_view=study.patrol.views[study.observability],
+                theme=theme,
                 title=f"Policy of {first.name}",
                 note=f"{study.patrol.name}, {study.observability} % observability",
             ),
@@ -527,29 +572,43 @@ def write(study: Study, folder: Path | str) -> Path:
             "Map of the patrol with the learned policy as arrows",
         ),
         drawn(
-            folder, "hidden-path", lambda theme: hidden_path(
-                study.stretch.posterior, study.stretch.seen, study.patrol.layout, study.stretch.path,
-                seconds=SECONDS_PER_STEP, theme=theme,
+            folder,
+            "hidden-path",
+            lambda theme: hidden_path(
+                study.stretch.posterior,
+                study.stretch.seen,
+                study.patrol.layout,
+                study.stretch.path,
+                seconds=SECONDS_PER_STEP,
+                theme=theme,
                 title=f"Where the patroller may have been ({study.patrol.name})",
             ),
-            "A stretch of patrol nobody learned from: belief about the hidden steps, given the seen ones.",
+            "A stretch of patrol outside the training data: belief about its hidden steps.",
             "Probability of each cell over time, with the true path",
         ),
-    ]  # fmt: skip
+    ]
     learning = [m for m in study.methods if m.name not in (RANDOM, TRUE)]
     if learning:
         curves = [LearningCurve(m.name, m.points, m.accuracy, m.log_likelihood) for m in learning]
-        pictures.append(drawn(
-            folder, "learning", lambda theme: learning_curves(curves, theme=theme),
-            "Accuracy of the learned behaviour, and likelihood of fresh demonstrations, as sessions go by.",
-            "Accuracy and log-likelihood against sessions",
-        ))  # fmt: skip
-        pictures.append(drawn(
-            folder, "time", partial(_draw_time, study, learning),
-            "Learning time of all patrollers together, without compilation. Running batch after every "
-            f"session is summed by interpolation between the {BATCH_POINTS} points at which it was timed.",
-            "Learning time against trajectories",
-        ))  # fmt: skip
+        pictures.append(
+            drawn(
+                folder,
+                "learning",
+                lambda theme: learning_curves(curves, theme=theme),
+                "Accuracy of the learned behaviour and likelihood of fresh demonstrations, by session.",
+                "Accuracy and log-likelihood against sessions",
+            )
+        )
+        pictures.append(
+            drawn(
+                folder,
+                "time",
+                partial(_draw_time, study, learning),
+                "Learning time of all patrollers together, without compilation. Running batch after every "
+                f"session is summed by interpolation between its {BATCH_POINTS} timed points.",
+                "Learning time against trajectories",
+            )
+        )
     rates = [
         SuccessRate(m.name, int((ended == REACHED).sum()), int((ended == TIMED_OUT).sum()), len(ended))
         for m in study.methods
@@ -557,22 +616,25 @@ def write(study: Study, folder: Path | str) -> Path:
         for ended in [m.breach.ended]
     ]
     if rates:
-        pictures.append(drawn(
-            folder, "success", lambda theme: success_rates(rates, theme=theme),
-            "Share of simulated breaches that reached a goal unseen, and that timed out.",
-            "Success and time-out rates by method",
-        ))  # fmt: skip
+        pictures.append(
+            drawn(
+                folder,
+                "success",
+                lambda theme: success_rates(rates, theme=theme),
+                "Share of simulated breaches that reached a goal undetected, and that timed out.",
+                "Success and time-out rates by method",
+            )
+        )
     sections = [Section("Results", _text(study), [_results_table(study)], pictures)]
     if study.determined:
         sections.append(identifiability_section(_by_patroller(study)))
-    title = f"What {study.patrol.name}'s patrollers want"
+    title = f"Rewards of {study.patrol.name}'s patrollers"
     return write_page(folder, title, _lead(study), sections, summary(study))
 
 
 def _draw_time(study: Study, learning: Sequence[MethodResult], theme: Theme) -> Figure:
     times = [
-        LearningTime(m.name if m.name != BATCH else "batch LME, one run", m.points, m.seconds)
-        for m in learning
+        LearningTime(m.name if m.name != BATCH else "batch LME, once", m.points, m.seconds) for m in learning
     ]
     if study.batch_rerun_seconds is not None:
         every = np.arange(1, study.sessions + 1)

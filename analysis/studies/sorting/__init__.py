@@ -1,4 +1,4 @@
-"""Sort onions in several ways at once (Figure 7.8, Table 7.2).
+"""Study of onion sorting with several behaviours (Figure 7.8, Table 7.2).
 
 Imports the rooms of judging, drawing, bounds and posteriors.
 """

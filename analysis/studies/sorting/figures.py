@@ -1,4 +1,4 @@
-"""Pictures of the sorting study: clusters, what each way does, and what was learned from how much."""
+"""Figures of the sorting study: components, their behaviours, and learning against data."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Embedding(NamedTuple):
 
 
 def embed(features: Float[np.ndarray, "n K"]) -> Embedding:
-    """The two directions along which features vary most, and where each trajectory lies (PCA by SVD).
+    """Project on the two directions along which features vary most, and place each trajectory (PCA by SVD).
 
     The largest loading of each direction is positive. Fewer than two varying directions leave zeros.
     """
@@ -81,7 +81,7 @@ def feature_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.nd
 def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
     """Trajectories of the first run on two principal components of feature counts, a panel a method.
 
-    The marker is the true way; the colour the way found.
+    The marker is the true component; the colour the component found.
     """
     mdp = study.sorting.mdp
     embedding = embed(feature_counts(mdp, study.demonstration))
@@ -99,10 +99,15 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
             for d, component in enumerate(components):
                 rows_here = (study.labels == b) & (result.found.assignments == component)
                 panel.plot(
-                    *embedding.points[rows_here].T, linestyle="", marker=MARKERS[b], markersize=7,
-                    markerfacecolor="none", markeredgecolor=theme.series[d % _COLOURS], markeredgewidth=1.5,
+                    *embedding.points[rows_here].T,
+                    linestyle="",
+                    marker=MARKERS[b],
+                    markersize=7,
+                    markerfacecolor="none",
+                    markeredgecolor=theme.series[d % _COLOURS],
+                    markeredgewidth=1.5,
                     alpha=0.85,
-                )  # fmt: skip
+                )
         dress(panel, theme, title=f"{result.name}: {counted(found, 'component')}")
         panel.margins(0.12)
         if i >= len(results) - columns:
@@ -114,16 +119,31 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
         panel.set_visible(False)
     names = study.sorting.behaviours
     handles: list[Artist] = [
-        Line2D([], [], linestyle="", marker=MARKERS[b], markersize=7, markerfacecolor="none",
-               markeredgecolor=theme.ink, label=f"done: {names[b]}")
+        Line2D(
+            [],
+            [],
+            linestyle="",
+            marker=MARKERS[b],
+            markersize=7,
+            markerfacecolor="none",
+            markeredgecolor=theme.ink,
+            label=f"done: {names[b]}",
+        )
         for b in range(study.tasks)
-    ]  # fmt: skip
+    ]
     handles += [
-        Line2D([], [], linestyle="", marker="o", markersize=8, color=theme.series[d % _COLOURS],
-               label=f"found: way {d + 1}"
-               + (" (more reuse colours)" if d == _COLOURS - 1 < most - 1 else ""))
+        Line2D(
+            [],
+            [],
+            linestyle="",
+            marker="o",
+            markersize=8,
+            color=theme.series[d % _COLOURS],
+            label=f"found: component {d + 1}"
+            + (" (more reuse colours)" if d == _COLOURS - 1 < most - 1 else ""),
+        )
         for d in range(min(most, _COLOURS))
-    ]  # fmt: skip
+    ]
     head(figure, theme, handles, title=f"{counted(len(study.labels), 'trajectory')}, first run")
     told = ";\n".join(f"component {k + 1}: {_loading(mdp, embedding.loadings[k])}" for k in range(2))
     foot(figure, theme, told)
@@ -131,18 +151,18 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
 
 
 def _loading(mdp: TabularMDP, loading: Float[np.ndarray, " K"]) -> str:
-    """The two features that a component weighs most, signed; short."""
+    """Name the two features that a component weighs most, signed; short."""
     top = [k for k in np.argsort(-np.abs(loading))[:2] if loading[k]]
     return ", ".join(f"{'more' if loading[k] > 0 else 'less'} {mdp.feature_names[k]!r}" for k in top)
 
 
 def _numbered(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> list[int]:
-    """The ways that have trajectories: as the behaviours they match, then those that match none."""
+    """Order the components that have trajectories: by the behaviours they match, then the unmatched ones."""
     matched = [component for _, component in sorted(match_components(labels, assignments).items())]
     return matched + [component for component in np.unique(assignments).tolist() if component not in matched]
 
 
-# -- what a way does ----------------------------------------------------------------------------------
+# -- behaviour of a component -------------------------------------------------------------------------
 
 # Where an onion is, left to right, and what is thought of it, from top to bottom; the bin below all.
 _COLUMN = {TABLE: 0.0, PUT_BACK: 0.0, HELD: 1.9, INSPECTED: 3.8}
@@ -170,7 +190,7 @@ class Flow(NamedTuple):
 
 
 def flow_of(sorting: Sorting, policy: Float[np.ndarray, "S A"], steps: int) -> Flow:
-    """Where ``steps`` steps of a policy are spent, and how it gets from place to place."""
+    """Compute where ``steps`` steps of a policy are spent, and the flow from place to place."""
     mdp = sorting.mdp
     always = jnp.broadcast_to(jnp.asarray(policy), (steps, *policy.shape))
     share = np.asarray(finite_occupancy(mdp, always)).mean(0)
@@ -195,7 +215,7 @@ def flow_of(sorting: Sorting, policy: Float[np.ndarray, "S A"], steps: int) -> F
 
 
 def components_diagram(study: SortingStudy, theme: Theme) -> Figure:
-    """What each way found makes of an onion: a state diagram a way, of the first method of the study.
+    """Draw each component found as a state diagram of an onion, of the first method of the study.
 
     Boxes are where the onion is and what is thought of it (hand and list left out); arrows are what the
     greedy policy of the learned weights does.
@@ -214,9 +234,11 @@ def components_diagram(study: SortingStudy, theme: Theme) -> Figure:
         panel.set_title(
             f"Way {number}: {sizes[component]} of {counted(len(study.labels), 'trajectory')}\n"
             + _likeness(sorting, policy, behaviour_of.get(component)),
-            color=theme.ink, fontsize=TEXT + 1, loc="left",
-        )  # fmt: skip
-    which = "Ways" if len(components) == len(shown) else f"{len(shown)} of {len(components)} ways"
+            color=theme.ink,
+            fontsize=TEXT + 1,
+            loc="left",
+        )
+    which = "Components" if len(components) == len(shown) else f"{len(shown)} of {len(components)} components"
     head(figure, theme, [], title=f"{which} found by {result.name}: what is done with an onion")
     foot(
         figure,
@@ -248,17 +270,28 @@ def draw_flow(axes: Axes, theme: Theme, sorting: Sorting, flow: Flow) -> None:
         color = theme.muted if place[0] == BIN else tint[place[1]]
         axes.add_patch(
             FancyBboxPatch(
-                (x - _HALF[0], y - _HALF[1]), 2 * _HALF[0], 2 * _HALF[1],
-                boxstyle="round,pad=0,rounding_size=0.12", zorder=3,
+                (x - _HALF[0], y - _HALF[1]),
+                2 * _HALF[0],
+                2 * _HALF[1],
+                boxstyle="round,pad=0,rounding_size=0.12",
+                zorder=3,
                 facecolor=(color, 0.28) if seen else theme.surface,
-                edgecolor=color if seen else theme.grid, linewidth=1.8 if seen else 1.0,
+                edgecolor=color if seen else theme.grid,
+                linewidth=1.8 if seen else 1.0,
             )
-        )  # fmt: skip
+        )
         text = "in the bin" if place[0] == BIN else PREDICTION[place[1]]
         axes.text(
-            x, y, text, ha="center", va="center", fontsize=SMALL + 0.5, zorder=4,
-            color=theme.ink if seen else theme.muted, linespacing=1.25,
-        )  # fmt: skip
+            x,
+            y,
+            text,
+            ha="center",
+            va="center",
+            fontsize=SMALL + 0.5,
+            zorder=4,
+            color=theme.ink if seen else theme.muted,
+            linespacing=1.25,
+        )
     for onion, name in _PLACE.items():
         axes.text(_COLUMN[onion], 1.68, name, ha="center", va="center", fontsize=TEXT, color=theme.muted)
     for (here, there), actions in flow.moves.items():
@@ -276,9 +309,15 @@ def _arrow(axes: Axes, theme: Theme, here: Place, there: Place, actions: dict[in
     label = "\n".join(f"{ACTIONS[a]} {share:.0%}" for a, share in sorted(actions.items()))
     width = 1.0 + 3.0 * total
     style: dict[str, Any] = {
-        "arrowstyle": f"-|>,head_length={4 + width},head_width={2 + width / 1.6}", "linewidth": width,
-        "color": theme.ink, "zorder": 2, "shrinkA": 0, "shrinkB": 0, "capstyle": "butt", "joinstyle": "miter",
-    }  # fmt: skip
+        "arrowstyle": f"-|>,head_length={4 + width},head_width={2 + width / 1.6}",
+        "linewidth": width,
+        "color": theme.ink,
+        "zorder": 2,
+        "shrinkA": 0,
+        "shrinkB": 0,
+        "capstyle": "butt",
+        "joinstyle": "miter",
+    }
     (x, y), (u, v) = _position(here), _position(there)
     aside = 0.0
     if here == there:
@@ -296,14 +335,21 @@ def _arrow(axes: Axes, theme: Theme, here: Place, there: Place, actions: dict[in
         at = (start[0] + along * (end[0] - start[0]), start[1] + along * (end[1] - start[1]))
         aside = 0.1 if u == x else 0.0
     axes.text(
-        at[0] + aside, at[1], label, ha="left" if aside else "center", va="center", fontsize=SMALL,
-        color=theme.ink, zorder=5, linespacing=1.15,
+        at[0] + aside,
+        at[1],
+        label,
+        ha="left" if aside else "center",
+        va="center",
+        fontsize=SMALL,
+        color=theme.ink,
+        zorder=5,
+        linespacing=1.15,
         bbox={"boxstyle": "round,pad=0.15", "facecolor": theme.surface, "edgecolor": "none", "alpha": 0.9},
-    )  # fmt: skip
+    )
 
 
 def _border(centre: tuple[float, float], towards: tuple[float, float]) -> tuple[float, float]:
-    """Where the line between two boxes leaves the first."""
+    """Find the point where the line between two boxes leaves the first."""
     dx, dy = towards[0] - centre[0], towards[1] - centre[1]
     reach = min(_HALF[0] / abs(dx) if dx else np.inf, _HALF[1] / abs(dy) if dy else np.inf)
     return centre[0] + dx * reach, centre[1] + dy * reach
@@ -313,7 +359,7 @@ def _border(centre: tuple[float, float], towards: tuple[float, float]) -> tuple[
 
 
 def evd_plot(study: SortingStudy, theme: Theme) -> Figure:
-    """EVD against trajectories: every run a dot, the mean a line, a bar over all runs.
+    """EVD against trajectories: every run a dot, the mean a line, a bar over all replications.
 
     The scale is logarithmic down to a power of ten below the smallest value that is not zero, and linear
     from there to zero.
@@ -358,23 +404,30 @@ def _draw_runs(
     theme: Theme,
     study: SortingStudy,
     i: int,
-    values: Float[np.ndarray, "runs T"],
+    values: Float[np.ndarray, "replications T"],
     middle: Float[np.ndarray, " T"],
 ) -> None:
-    """The ``i``-th method's runs, beside those of the others: bands of so many could not be told apart."""
+    """Draw the ``i``-th method's replications as dots beside those of the other methods."""
     result = study.results[i]
     style = method_styles(theme, [r.name for r in study.results])[result.name]
     x = result.trajectories * np.exp(0.05 * (i - (len(study.results) - 1) / 2))
     axes.plot(
-        np.broadcast_to(x, values.shape).ravel(), values.ravel(), linestyle="", markersize=4.5, alpha=0.5,
-        marker=style["marker"], color=style["color"], markeredgewidth=0, clip_on=False,
-    )  # fmt: skip
+        np.broadcast_to(x, values.shape).ravel(),
+        values.ravel(),
+        linestyle="",
+        markersize=4.5,
+        alpha=0.5,
+        marker=style["marker"],
+        color=style["color"],
+        markeredgewidth=0,
+        clip_on=False,
+    )
     axes.vlines(x, values.min(0), values.max(0), color=style["color"], linewidth=1.6, alpha=0.45)
     axes.plot(x, middle, label=result.name, linewidth=1.6, markersize=6.5, clip_on=False, **style)
 
 
 def components_plot(study: SortingStudy, theme: Theme) -> Figure:
-    """How many ways were found: at each number of trajectories a disc as large as the share of runs."""
+    """Draw the number of components found: the area of a disc is a share of replications."""
     results = study.results
     figure = new_figure(theme, max(1.2 + 2.3 * len(results), _WIDTH_OF_TEXT), 3.9)
     panels = figure.subplots(1, len(results), sharey=True, squeeze=False)[0]
@@ -385,17 +438,21 @@ def components_plot(study: SortingStudy, theme: Theme) -> Figure:
     for i, (panel, result) in enumerate(zip(panels, results, strict=True)):
         panel.axhline(study.tasks, color=theme.goal, linewidth=1.6, zorder=1)
         for t in range(len(result.trajectories)):
-            numbers, runs = np.unique(result.measures.n_components[:, t], return_counts=True)
+            numbers, replications = np.unique(result.measures.n_components[:, t], return_counts=True)
             panel.scatter(
-                np.full(len(numbers), t), numbers, s=largest * runs / study.runs, zorder=2, linewidth=0,
+                np.full(len(numbers), t),
+                numbers,
+                s=largest * replications / study.replications,
+                zorder=2,
+                linewidth=0,
                 color=[theme.series[0] if n == study.tasks else theme.series[1] for n in numbers],
-            )  # fmt: skip
+            )
         dress(panel, theme, title=result.name, x="trajectories", grid="y")
         panel.title.set_fontsize(TEXT)
         panel.set_xticks(range(len(result.trajectories)), [f"{n}" for n in result.trajectories])
         panel.set_xlim(-0.6, len(result.trajectories) - 0.4)
         panel.tick_params(axis="y", left=i == 0)
-    panels[0].set_ylabel("ways found", color=theme.ink)
+    panels[0].set_ylabel("components found", color=theme.ink)
     panels[0].set_ylim(0.3, most + 0.7)
     panels[0].yaxis.set_major_locator(MaxNLocator(integer=True))
     disc: dict[str, Any] = {"linestyle": "", "marker": "o", "markersize": 10}
@@ -404,7 +461,7 @@ def components_plot(study: SortingStudy, theme: Theme) -> Figure:
         Line2D([], [], color=theme.series[1], label="another", **disc),
         Line2D([], [], color=theme.goal, linewidth=1.6, label=f"truth: {study.tasks}"),
     ]
-    head(figure, theme, handles, title="Number of ways found")
+    head(figure, theme, handles, title="Number of components found")
     foot(figure, theme, f"area of a disc: share of {_all_runs(study)}")
     return figure
 
@@ -426,7 +483,11 @@ def time_plot(study: SortingStudy, theme: Theme) -> Figure:
 
 
 def _all_runs(study: SortingStudy) -> str:
-    return "the one run" if study.runs == 1 else f"all {counted(study.runs, 'run')}"
+    return (
+        "the one replication"
+        if study.replications == 1
+        else f"all {counted(study.replications, 'replication')}"
+    )
 
 
 def _at_counts(axes: Axes, study: SortingStudy) -> None:

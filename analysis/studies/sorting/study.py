@@ -1,8 +1,8 @@
-"""Onion sorting in several ways at once (Figure 7.8, Table 7.2): who finds them, from how much, how fast.
+"""Study of onion sorting with several behaviours (Figure 7.8, Table 7.2): recovery, data and time of each
+method.
 
-Sorters who behave in two or three ways are learned from one jumble of their trajectories, by batch and online
-MME-MTIRL and by the baselines, all from the same trajectories. Learning is timed after a first call that
-compiles.
+Batch and online MME-MTIRL and the baselines learn two or three behaviours from the same mixed trajectories.
+Learning is timed after a first call that compiles.
 """
 
 from __future__ import annotations
@@ -45,18 +45,18 @@ STEPS = 50
 # Fewer, since every method is compiled for every number of trajectories.
 FEW = {2: (4, 8, 16), 3: (6, 12, 24)}
 
-BATCH, ONLINE, DPM, EM, EM_UNTOLD = "mme-mtirl", "online", "dpm-birl", "em-mlirl", "em-mlirl-untold"
+BATCH, ONLINE, DPM, EM, EM_UNKNOWN = "mme-mtirl", "online", "dpm-birl", "em-mlirl", "em-mlirl-unknown"
 METHODS = {
     BATCH: "MME-MTIRL",
     ONLINE: "online MME-MTIRL",
     DPM: "DPM-BIRL",
     EM: "EM-MLIRL",
-    EM_UNTOLD: "EM-MLIRL, not told",
+    EM_UNKNOWN: "EM-MLIRL, number unknown",
 }
 
 
 class Measures(NamedTuple):
-    """What is measured of a method, each ``[runs, T]``.
+    """Measures of a method, each ``[replications, T]``.
 
     Fields
     ------
@@ -72,11 +72,11 @@ class Measures(NamedTuple):
         Of learning, compilation left out; online: of all sessions so far.
     """
 
-    value_difference: Float[np.ndarray, "runs T"]
-    n_components: Int[np.ndarray, "runs T"]
-    accuracy: Float[np.ndarray, "runs T"]
-    rand: Float[np.ndarray, "runs T"]
-    seconds: Float[np.ndarray, "runs T"]
+    value_difference: Float[np.ndarray, "replications T"]
+    n_components: Int[np.ndarray, "replications T"]
+    accuracy: Float[np.ndarray, "replications T"]
+    rand: Float[np.ndarray, "replications T"]
+    seconds: Float[np.ndarray, "replications T"]
 
 
 class MethodResult(NamedTuple):
@@ -99,23 +99,23 @@ class MethodResult(NamedTuple):
 
 
 class SortingStudy(NamedTuple):
-    """Settings, results, and Table 7.2 with the weights of the first run.
+    """Settings, results, and Table 7.2 with the weights of the first replication.
 
     Fields
     ------
     sorting : Sorting
-    tasks, n_components, steps, runs, seed : int
-        Behaviours demonstrated; ways that learners begin with; steps of a trajectory.
+    tasks, n_components, steps, replications, seed : int
+        Behaviours demonstrated; components that learners begin with; steps of a trajectory.
     counts : int ``[T]``
         Numbers of trajectories that batch methods learn from.
     sessions : int ``[J]``
         Trajectories that the online learner has seen at the end of each session.
     results : tuple of MethodResult
     one_component : float
-        EVD of the best single behaviour for all trajectories of the first run: what a learner that tells
-        nothing apart can reach.
+        EVD of the best single behaviour for all trajectories of the first replication: the best of a learner
+        with one component.
     demonstration, labels
-        All trajectories of the first run, and their behaviours.
+        All trajectories of the first replication, and their behaviours.
     table : SortingTable
     """
 
@@ -123,7 +123,7 @@ class SortingStudy(NamedTuple):
     tasks: int
     n_components: int
     steps: int
-    runs: int
+    replications: int
     seed: int
     counts: Int[np.ndarray, " T"]
     sessions: Int[np.ndarray, " J"]
@@ -135,7 +135,7 @@ class SortingStudy(NamedTuple):
 
     @property
     def online_share(self) -> float | None:
-        """Seconds of all online sessions over those of batch run again at the end of each: median of runs.
+        """Seconds of all online sessions over those of batch after each session, median over replications.
 
         None if the two were not both measured at the same numbers of trajectories.
         """
@@ -158,7 +158,7 @@ def sorting_study(
     tasks: int = 2,
     counts: Sequence[int] | None = None,
     *,
-    runs: int = 3,
+    replications: int = 3,
     seed: int = 0,
     methods: Sequence[str] | None = None,
     sessions: int | None = None,
@@ -167,7 +167,7 @@ def sorting_study(
     belts: int = 300,
     advance: Advance = lambda description, fraction: None,
 ) -> SortingStudy:
-    """Learn the sorters' ways with every method, from more and more of the same trajectories.
+    """Learn the sorters' behaviours with every method, from growing numbers of the same trajectories.
 
     Parameters
     ----------
@@ -176,16 +176,16 @@ def sorting_study(
     counts : sequence of int, optional
         Numbers of trajectories, about as many of each behaviour. By default :data:`FEW` of them;
         :data:`GRID` has the dissertation's.
-    runs, seed : int
+    replications, seed : int
         Independent repetitions. A smaller number of trajectories is the beginning of a larger one's.
     methods : sequence of str, optional
-        Keys of :data:`METHODS`, all by default. EM-MLIRL is given the true number of ways, as in the
-        dissertation, or, not told, ``n_components`` of them like MME-MTIRL; both from as many starts as that.
+        Keys of :data:`METHODS`, all by default. EM-MLIRL is given the true number of components, as in the
+        dissertation, or ``n_components`` of them like MME-MTIRL; both from as many starts as that.
     sessions : int, optional
         The online learner's, equal in size. By default its sessions end at ``counts``, as in the
         dissertation.
     n_components : int
-        Ways that MME-MTIRL starts from: the most it can find.
+        Components that MME-MTIRL starts with: the most it can find.
     steps : int
         Of a trajectory.
     belts : int
@@ -196,14 +196,16 @@ def sorting_study(
     ValueError
         For numbers that make no study, saying which.
     """
-    _check(tasks, counts, runs, methods, sessions, n_components, steps, belts)
+    _check(tasks, counts, replications, methods, sessions, n_components, steps, belts)
     sizes = np.array(sorted(set(FEW[tasks] if counts is None else counts)))
     most = int(sizes[-1])
     ends = sizes if sessions is None else np.linspace(0, most, sessions + 1).round().astype(int)[1:]
     sorting = sorting_with_claiming()
     walk, belt = jax.random.split(jax.random.key(seed))
     borders = np.union1d(sizes, ends)
-    streams = [_stream(jax.random.fold_in(walk, run), sorting, tasks, borders, steps) for run in range(runs)]
+    streams = [
+        _stream(jax.random.fold_in(walk, run), sorting, tasks, borders, steps) for run in range(replications)
+    ]
     chosen = [name for name in METHODS if methods is None or name in methods]
     results = []
     for i, method in enumerate(chosen):
@@ -217,7 +219,7 @@ def sorting_study(
         else:
             fits = _batch_fits(sorting.mdp, method, tasks, n_components, sizes)
             with warnings.catch_warnings():
-                # That fewer trajectories than ways give fewer ways is said once, with the results.
+                # The results state once that fewer trajectories than components give fewer components.
                 warnings.filterwarnings("ignore", "[0-9]+ ways were to be started from")
                 measured = _batch(sorting, tasks, METHODS[method], fits, streams, tell)
         results.append(measured)
@@ -227,9 +229,20 @@ def sorting_study(
     table = table_7_2(belt, sorting, learned, belts=belts)
     advance("done", 1.0)
     return SortingStudy(
-        sorting, tasks, n_components, steps, runs, seed, sizes, ends, tuple(results),
-        _one_component(sorting, tasks, first), first.demonstration, first.labels, table,
-    )  # fmt: skip
+        sorting,
+        tasks,
+        n_components,
+        steps,
+        replications,
+        seed,
+        sizes,
+        ends,
+        tuple(results),
+        _one_component(sorting, tasks, first),
+        first.demonstration,
+        first.labels,
+        table,
+    )
 
 
 def counts_of(tasks: int, text: str | None) -> tuple[int, ...] | None:
@@ -252,7 +265,7 @@ def counts_of(tasks: int, text: str | None) -> tuple[int, ...] | None:
 def _check(
     tasks: int,
     counts: Sequence[int] | None,
-    runs: int,
+    replications: int,
     methods: Sequence[str] | None,
     sessions: int | None,
     n_components: int,
@@ -263,7 +276,12 @@ def _check(
         raise ValueError(
             f"tasks must be 2 (pick-inspect-place and roll-pick-place) or 3 (and keep claiming), got {tasks}"
         )
-    for name, number in (("n_components", n_components), ("runs", runs), ("steps", steps), ("belts", belts)):
+    for name, number in (
+        ("n_components", n_components),
+        ("replications", replications),
+        ("steps", steps),
+        ("belts", belts),
+    ):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
     counts = FEW[tasks] if counts is None else counts
@@ -309,7 +327,7 @@ def _batch_fits(
     if method == DPM:
         return dict.fromkeys(sizes.tolist(), dpm_birl(mdp).fit)
     given = tasks if method == EM else n_components
-    # EM refuses more ways than trajectories.
+    # EM requires at most as many components as trajectories.
     return {
         n: em_mlirl(mdp, n_components=min(given, n), restarts=DEFAULT_RESTARTS).fit for n in sizes.tolist()
     }
@@ -374,7 +392,7 @@ def _online(
 def _explained(
     mdp: TabularMDP, state: Any, log_likelihood: float, demonstration: Demonstration
 ) -> Clustering:
-    """All trajectories so far under what an online learner knows now; it has kept none of them."""
+    """Explain all trajectories so far by an online learner's current state; it holds none of them."""
     proportions = np.asarray(state.proportions)
     present = np.argsort(-proportions, kind="stable")[: np.count_nonzero(proportions)]
     shares = assign_trajectories(mdp, None, state.weights, proportions, demonstration)[:, present]
@@ -396,9 +414,12 @@ def _judged(
         sorting.mdp, sorting.weights[:tasks], labels, found.weights, assignments, demonstration
     )
     return (
-        evd, len(np.unique(assignments)), assignment_accuracy(labels, assignments),
-        adjusted_rand_index(labels, assignments), seconds,
-    )  # fmt: skip
+        evd,
+        len(np.unique(assignments)),
+        assignment_accuracy(labels, assignments),
+        adjusted_rand_index(labels, assignments),
+        seconds,
+    )
 
 
 def _measures(columns: Sequence[Sequence[tuple[float, ...]]]) -> Measures:
@@ -408,7 +429,7 @@ def _measures(columns: Sequence[Sequence[tuple[float, ...]]]) -> Measures:
 
 
 def _behaviours_of(labels: Int[np.ndarray, " n"], found: Clustering) -> Float[np.ndarray, "B K"]:
-    """Learned weights of each behaviour; without a way of its own, that of most of it."""
+    """Return the learned weights of each behaviour: its component's, or that of most of its trajectories."""
     assignments = found.assignments
     matched = match_components(labels, assignments)
     rows = [
@@ -421,8 +442,12 @@ def _one_component(sorting: Sorting, tasks: int, stream: _Stream) -> float:
     nobody_told_apart = np.zeros(len(stream.labels), int)
     return min(
         expected_value_difference(
-            sorting.mdp, sorting.weights[:tasks], stream.labels, weights[None], nobody_told_apart,
+            sorting.mdp,
+            sorting.weights[:tasks],
+            stream.labels,
+            weights[None],
+            nobody_told_apart,
             stream.demonstration,
         )
         for weights in sorting.weights[:tasks]
-    )  # fmt: skip
+    )

@@ -1,13 +1,13 @@
-"""Table 7.2 side by side: precision and recall of learned ways of sorting, simulated and as published.
+"""Table 7.2 side by side: precision and recall of learned sorting, simulated and as published.
 
-What each method learned is carried out on simulated belts (:mod:`i2rl.domains.sorting.line`) beside the
-experts. What is and is not comparable:
+Each learned policy runs on simulated belts (:mod:`i2rl.domains.sorting.line`) beside the experts.
+Comparability of the numbers:
 
 - The dissertation carried out each policy once, on 24 onions, on a robot. Seven of twelve blemished onions
   found is a recall of 58 % with a 95 % interval from 32 to 81 %: most differences between its rows are within
   chance. Here hundreds of belts are sorted and the interval is a few percent; both are shown.
 - The line's times are calibrated to the dissertation's *expert* row, so that row agrees by construction; only
-  the distances of learned rows from it say anything.
+  the distances of learned rows from it are informative.
 - A learned policy equal to the expert's gives the expert's numbers here, to the digit, since all rows sort
   the same belts. On the robot its row differed by chance.
 - Every method sorts for the same time here. On the robot, online MME-MTIRL began earlier, since it had
@@ -149,10 +149,14 @@ def table_7_2(
             overall, choice = policy_accuracy(sorting.mdp, optimal[b], jnp.asarray(policy))
             rows.append(
                 SortingRow(
-                    method, behaviour, sort_belts(key, sorting, policy, belts, line), float(overall),
-                    float(choice), published.get(method.casefold(), {}).get(behaviour),
+                    method,
+                    behaviour,
+                    sort_belts(key, sorting, policy, belts, line),
+                    float(overall),
+                    float(choice),
+                    published.get(method.casefold(), {}).get(behaviour),
                 )
-            )  # fmt: skip
+            )
     return SortingTable(tuple(rows), belts, line, level)
 
 
@@ -183,7 +187,7 @@ def _policies(sorting: Sorting, values: np.ndarray) -> Float[np.ndarray, "B S A"
 
 
 def sorting_table_summary(table: SortingTable) -> dict[str, Any]:
-    """The table as plain data for JSON: shares in [0, 1], ``None`` where nothing was binned."""
+    """Return the table as plain data for JSON: shares in [0, 1], ``None`` if no onion was binned."""
     return {
         "belts": table.belts,
         "line": table.line._asdict(),
@@ -218,7 +222,7 @@ HEADINGS = ("method", "belts", "TP, FP, TN, FN", "precision, %", "recall, %", "L
 
 
 def caption(table: SortingTable) -> str:
-    """What the columns mean."""
+    """Write the meaning of the columns."""
     return (
         "TP, FP: blemished and good onions in the bin; TN, FN: good and blemished ones left on the table. "
         f"Simulated: means of {counted(table.belts, 'belt')}; dissertation: its one belt of 24 onions. In "
@@ -228,7 +232,7 @@ def caption(table: SortingTable) -> str:
 
 
 def behaviours(table: SortingTable) -> tuple[str, ...]:
-    """The behaviours of the table, in its order."""
+    """List the behaviours of the table, in its order."""
     return tuple(dict.fromkeys(row.behaviour for row in table.rows))
 
 
@@ -285,7 +289,7 @@ def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str 
                 here = getattr(row.tally, measure)(table.level)
                 if math.isnan(here.value):
                     panel.annotate(
-                        "nothing binned", (0.015, y), va="center", color=theme.muted, fontsize=TEXT - 1
+                        "no onion binned", (0.015, y), va="center", color=theme.muted, fontsize=TEXT - 1
                     )
                 panel.hlines(y, here.low, here.high, color=ours, linewidth=2.4)
                 panel.plot(here.value, y, "o", markersize=6.5, color=ours, clip_on=False)
@@ -293,13 +297,22 @@ def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str 
                     value, low, high = getattr(row.published, measure)(table.level)
                     panel.hlines(middle + 0.16, low, high, color=theirs, linewidth=1.2)
                     panel.plot(
-                        value, middle + 0.16, "D", markersize=6, markerfacecolor=theme.surface,
-                        markeredgecolor=theirs, markeredgewidth=1.4, clip_on=False,
-                    )  # fmt: skip
+                        value,
+                        middle + 0.16,
+                        "D",
+                        markersize=6,
+                        markerfacecolor=theme.surface,
+                        markeredgecolor=theirs,
+                        markeredgewidth=1.4,
+                        clip_on=False,
+                    )
             dress(
-                panel, theme, title=f"{behaviour}: {measure}", grid="x",
+                panel,
+                theme,
+                title=f"{behaviour}: {measure}",
+                grid="x",
                 x=_MEANING[measure] if i == len(names) - 1 else "",
-            )  # fmt: skip
+            )
             panel.set_xlim(0, 1.02)
             panel.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
         name_ticks(panels[i, 0], "y", range(len(methods)), methods, fontsize=TEXT)
@@ -308,10 +321,16 @@ def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str 
     handles = [
         Line2D([], [], color=ours, marker="o", markersize=6.5, linewidth=2.4, label="simulated belts"),
         Line2D(
-            [], [], color=theirs, marker="D", markersize=6, markerfacecolor=theme.surface, linewidth=1.2,
+            [],
+            [],
+            color=theirs,
+            marker="D",
+            markersize=6,
+            markerfacecolor=theme.surface,
+            linewidth=1.2,
             label="dissertation, one belt",
         ),
-    ]  # fmt: skip
+    ]
     head(figure, theme, handles, title=title)
     belts = f"simulated: {counted(table.belts, 'belt')}; dissertation: one belt, 24 onions"
     foot(figure, theme, f"bars: {table.level:.0%} intervals; {belts}")

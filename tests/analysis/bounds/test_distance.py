@@ -1,4 +1,4 @@
-"""How far reports and posteriors can be apart, against enumeration."""
+"""Distances of observations and of posteriors, against enumeration."""
 
 import itertools
 
@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from i2rl.analysis.bounds.distance import (
     Perception,
     model_distance,
+    observation_distance,
     posterior_distance,
-    report_distance,
 )
 from i2rl.models import FeatureNoise, Visibility
 
@@ -44,8 +44,8 @@ def test_reports_and_posteriors_are_within_their_distances(seed, error):
     perception = Perception(1, error, predicates=2, longest=2)
     before, after = likelihoods(true), likelihoods(counted)
     variation = np.abs(before - after).sum(axis=1).max() / 2
-    assert variation <= report_distance(perception, counted) + 1e-12
-    assert report_distance(perception, counted) <= report_distance(perception) <= 4 * error
+    assert variation <= observation_distance(perception, counted) + 1e-12
+    assert observation_distance(perception, counted) <= observation_distance(perception) <= 4 * error
     prior = rng.dirichlet(np.ones(16))
     change = np.abs(posteriors(prior, before) - posteriors(prior, after)).sum(axis=0).max() / 2
     assert change <= posterior_distance(perception, counted) + 1e-12
@@ -58,10 +58,10 @@ def test_the_mean_over_reports_changes_by_the_distance_of_reports_at_most(seed, 
     true = rng.uniform(0.2, 0.8, 2)
     counted = true + error * rng.choice([-1, 1], 2)
     prior, features = rng.dirichlet(np.full(16, 0.3)), rng.uniform(size=16)
-    reports = prior @ likelihoods(true)
+    observations = prior @ likelihoods(true)
     learned = features @ posteriors(prior, likelihoods(counted))
     perception = Perception(1, error, predicates=2, longest=2)
-    assert abs(reports @ learned - prior @ features) <= report_distance(perception, counted) + 1e-12
+    assert abs(observations @ learned - prior @ features) <= observation_distance(perception, counted) + 1e-12
 
 
 def one_predicate(belief, reliability):
@@ -87,8 +87,8 @@ def test_no_smaller_multiple_of_the_error_would_do_in_expectation():
 
 def test_under_other_weights_not_even_the_expectation_is_bounded():
     # The truth holds half of the time; a learner who believes in one percent reads yes too cautiously.
-    reports = np.array([0.5, 0.5])
-    change = reports @ (one_predicate(0.01, 0.995) - one_predicate(0.01, 0.99))
+    observations = np.array([0.5, 0.5])
+    change = observations @ (one_predicate(0.01, 0.995) - one_predicate(0.01, 0.99))
     assert abs(change) > 10 * 0.005
 
 
@@ -138,15 +138,15 @@ def test_a_reliability_that_may_be_one_leaves_no_bound_by_odds():
     perception = Perception(1, 0.05, 1, 3)
     assert posterior_distance(perception, np.array([0.96])) == 1
     assert posterior_distance(perception, np.array([0.9])) < 1
-    assert report_distance(perception, np.array([0.96])) < 1
+    assert observation_distance(perception, np.array([0.96])) < 1
 
 
 def test_what_cannot_be_compared_is_refused():
     perception = Perception(1, 0.05, 2, 3)
     with pytest.raises(ValueError, match="reliabilities are 2 probabilities"):
-        report_distance(perception, np.array([0.9]))
+        observation_distance(perception, np.array([0.9]))
     with pytest.raises(ValueError, match="epsilon_o must be positive, got 0"):
-        report_distance(perception._replace(epsilon_o=0.0))
+        observation_distance(perception._replace(epsilon_o=0.0))
     noise = binary_noise([0.9, 0.9, 0.9])
     with pytest.raises(ValueError, match="without an observation model"):
         model_distance(noise, Visibility(np.ones(4)))

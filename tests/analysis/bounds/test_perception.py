@@ -67,22 +67,22 @@ def test_the_theorem_says_whose_posterior_it_is_about():
 def test_the_data_that_are_asked_for_keep_the_promise():
     needed = perception_needed(6, 8, 3, 0.3, 0.8)
     printed, corrected = needed.loc["printed"], needed.loc["corrected"]
-    perception = Perception(printed.reports, printed.epsilon_o, 8, 3)
+    perception = Perception(printed.observations, printed.epsilon_o, 8, 3)
     bound = rimeo_constraint_bound(printed.trajectories, printed.draws, 0.1, 0.1, perception, 6)
     assert bound.confidence >= 0.8
     assert bound.error == pytest.approx(0.3)
-    perception = Perception(corrected.reports, corrected.epsilon_o, 8, 3)
+    perception = Perception(corrected.observations, corrected.epsilon_o, 8, 3)
     bound = noisy_constraint_bound(corrected.trajectories, 0.15, perception, 6)
     assert bound.confidence >= 0.8
     assert bound.error == pytest.approx(0.3)
-    assert (corrected[["trajectories", "reports"]] < printed[["trajectories", "reports"]]).all()
-    fewer = Perception(corrected.reports * 0.9, corrected.epsilon_o, 8, 3)
+    assert (corrected[["trajectories", "observations"]] < printed[["trajectories", "observations"]]).all()
+    fewer = Perception(corrected.observations * 0.9, corrected.epsilon_o, 8, 3)
     assert noisy_constraint_bound(corrected.trajectories, 0.15, fewer, 6).confidence < 0.8
 
 
 def test_reports_grow_with_the_square_of_steps():
     short, long = (perception_needed(6, 8, steps, 0.15, 0.8).loc["corrected"] for steps in (3, 300))
-    assert long.reports / short.reports == pytest.approx(1e4, rel=0.01)
+    assert long.observations / short.observations == pytest.approx(1e4, rel=0.01)
 
 
 def test_rimeos_regret_needs_more_than_lmes():
@@ -95,13 +95,13 @@ def test_rimeos_regret_needs_more_than_lmes():
 
 def test_the_sizes_of_sessions_keep_rimeos_confidence_for_ever():
     sizes = rimeo_no_regret_sizes(5.0, 100, 0.1, 2, 3, 4, 0.9)
-    regret = rimeo_no_regret(5.0, sizes.trajectories, sizes.draws, sizes.reports, 2, 3, 4, 0.9)
+    regret = rimeo_no_regret(5.0, sizes.trajectories, sizes.draws, sizes.observations, 2, 3, 4, 0.9)
     assert (regret.confidence >= 0.9).all()
     assert regret.bound.confidence >= 0.9
     assert (sizes.iloc[-1] > sizes.iloc[0]).all()
     for name in sizes:
         fewer = sizes.assign(**{name: np.maximum(sizes[name] // 2, 1)})
-        poorer = rimeo_no_regret(5.0, fewer.trajectories, fewer.draws, fewer.reports, 2, 3, 4, 0.9)
+        poorer = rimeo_no_regret(5.0, fewer.trajectories, fewer.draws, fewer.observations, 2, 3, 4, 0.9)
         assert poorer.bound.confidence < 0.9
     same = rimeo_no_regret(5.0, [1000] * 100, [10**6] * 100, [10**7] * 100, 2, 3, 4, 0.9)
     assert same.confidence[-1] == 0
@@ -114,7 +114,7 @@ def test_errors_and_sizes_out_of_range_are_refused():
         perception_needed(6, 8, 3, 0.2, 1.0)
     with pytest.raises(ValueError, match="predicates must be at least 1, got 0"):
         perception_needed(6, 0, 3, 0.2, 0.8)
-    with pytest.raises(ValueError, match="2 session sizes, but 2 numbers of samples and 1 of reports"):
+    with pytest.raises(ValueError, match="2 session sizes, but 2 numbers of samples and 1 of observations"):
         rimeo_no_regret(5.0, [1, 1], [1, 1], [1], 2, 3, 4, 0.9)
     with pytest.raises(ValueError, match="longest must be at least 1, got 0"):
         noisy_constraint_bound(10, 0.1, PERCEPTION._replace(longest=0), 6)
@@ -125,10 +125,10 @@ def test_the_command_line_says_what_noisy_perception_asks_for():
     content = json.loads(CliRunner().invoke(app, [*asked, "--json"]).stdout)
     needed = perception_needed(6, 8, 3, 0.15, 0.8)
     for row in content["perception"]:
-        assert row["reports"] == needed.loc[row["bound"], "reports"]
+        assert row["observations"] == needed.loc[row["bound"], "observations"]
         assert row["epsilon_o"] == pytest.approx(needed.loc[row["bound"], "epsilon_o"])
     told = " ".join(CliRunner().invoke(app, asked).output.split())
-    assert str(needed.loc["corrected", "reports"]) in told
+    assert str(needed.loc["corrected", "observations"]) in told
     assert "under weights as good as the expert's" in told
     half = CliRunner().invoke(app, asked[:-2])
     assert half.exit_code != 0

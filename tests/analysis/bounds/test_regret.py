@@ -44,11 +44,11 @@ def plan(mdp):
     return soft_plan(mdp, reward_of(mdp, TRUE))
 
 
-def streams(mdp, sensor, runs, sessions, length, trajectories=1):
+def streams(mdp, sensor, replications, sessions, length, trajectories=1):
     """Independent trajectories of the soft expert as arrays ``[R, T, n, L]``."""
     law = TrajectoryLaw(mdp, TRUE, sensor, length)
-    codes = sample_demonstration(jax.random.key(3), law, runs * sessions * trajectories).codes
-    return Demonstration.from_codes(codes.reshape(runs, sessions, trajectories, length, 3))
+    codes = sample_demonstration(jax.random.key(3), law, replications * sessions * trajectories).codes
+    return Demonstration.from_codes(codes.reshape(replications, sessions, trajectories, length, 3))
 
 
 def test_visits_are_powers_of_the_transition_matrix(mdp, plan, dense_transitions):

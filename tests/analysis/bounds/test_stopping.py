@@ -44,11 +44,11 @@ def reports():
             for i in t
         ]
         for s in range(STREAMS)
-    ]  # fmt: skip
+    ]
 
 
 def stops_of(rule, reports):
-    """The rule itself, after every session of every stream."""
+    """Apply the rule itself, after every session of every stream."""
     return [next((i for i in range(1, len(stream) + 1) if rule(stream[:i])), NEVER) for stream in reports]
 
 
@@ -118,7 +118,7 @@ def test_a_stop_is_false_where_the_stream_would_have_become_better():
     ])  # fmt: skip
     stops = np.array([3, 1, 2, NEVER])
     verdict = judge_stops(stops, accuracy, margin=0.1, tail=2)
-    assert (verdict.false_stops, verdict.stops, verdict.runs) == (2, 3, 4)
+    assert (verdict.false_stops, verdict.stops, verdict.replications) == (2, 3, 4)
     assert verdict.used.tolist() == [3, 1, 2, 5]
     assert verdict.false_rate == 0.5
     assert verdict.saved == pytest.approx(1 - 11 / 20)
@@ -136,9 +136,14 @@ def test_stopping_at_the_end_or_never_is_no_false_stop():
 
 @pytest.mark.parametrize(
     ("stops", "margin", "tail", "message"),
-    [([1, 2], 0.1, 1, "stops must be 3"), ([1, 2, 9], 0.1, 1, "from 1 to 9"), ([1, 2, -1], 0.1, 1, "from -1"),
-     ([1, 2, 3], -0.1, 1, "margin"), ([1, 2, 3], 0.1, 5, "tail 1 to 4")],
-)  # fmt: skip
+    [
+        ([1, 2], 0.1, 1, "stops must be 3"),
+        ([1, 2, 9], 0.1, 1, "from 1 to 9"),
+        ([1, 2, -1], 0.1, 1, "from -1"),
+        ([1, 2, 3], -0.1, 1, "margin"),
+        ([1, 2, 3], 0.1, 5, "tail 1 to 4"),
+    ],
+)
 def test_impossible_judgements_are_refused(stops, margin, tail, message):
     with pytest.raises(ValueError, match=message):
         judge_stops(np.array(stops), np.zeros((3, 4)), margin, tail)
@@ -148,8 +153,10 @@ def test_impossible_judgements_are_refused(stops, margin, tail, message):
 def test_the_figure_has_a_line_a_rule(reports, theme):
     likelihood = field(reports, "log_likelihood")
     accuracy = 1 - 1 / np.arange(1, SESSIONS + 1)[None].repeat(STREAMS, axis=0)
-    rules = {"single": lambda x: likelihood_change(likelihood, x),
-             "window": lambda x: moving_window(likelihood, 5, x)}  # fmt: skip
+    rules = {
+        "single": lambda x: likelihood_change(likelihood, x),
+        "window": lambda x: moving_window(likelihood, 5, x),
+    }
     sweeps = [sweep_tolerance(n, "nats", r, [0.001, 0.1, 1.0], accuracy, 0.05, 3) for n, r in rules.items()]
     assert sweeps[0].at(0.1) is sweeps[0].verdicts[1]
     with pytest.raises(ValueError, match=r"not run at rho = 0.2"):

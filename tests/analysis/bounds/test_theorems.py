@@ -166,7 +166,7 @@ def test_an_observed_bound_covers_the_expected_likelihood(random_mdp):
     # Any independent values in range with the expert's mean will do: the theorem knows no more of them.
     rng = np.random.default_rng(4)
     scaled = mean * (1 - discount)
-    runs = [rng.binomial(20, scaled, (150, len(scaled))) / 20 / (1 - discount) for _ in range(40)]
+    replications = [rng.binomial(20, scaled, (150, len(scaled))) / 20 / (1 - discount) for _ in range(40)]
 
     @jax.jit
     def gap(target, slack):
@@ -174,7 +174,7 @@ def test_an_observed_bound_covers_the_expected_likelihood(random_mdp):
         return (weights - learned.weights) @ mean - mdp.initial @ (plan.values - learned.values)
 
     covered = []
-    for features in runs:
+    for features in replications:
         observed = observed_bound(features, 0.9, discount, np.asarray(weights))
         value = float(gap(jnp.asarray(observed.target), jnp.asarray(observed.slack)))
         assert value >= -1e-9

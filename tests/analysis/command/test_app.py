@@ -42,14 +42,19 @@ def circle(discount: float = 0.9) -> TabularMDP:
     features[:, 1, 0] = 1
     features[1, :, 1] = 1
     return TabularMDP.from_successors(
-        successors, probabilities, features, discount=discount, states=["west", "north", "east", "south"],
-        actions=["stay", "on"], feature_names=["goes on", "is north"],
-    )  # fmt: skip
+        successors,
+        probabilities,
+        features,
+        discount=discount,
+        states=["west", "north", "east", "south"],
+        actions=["stay", "on"],
+        feature_names=["goes on", "is north"],
+    )
 
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_once(tmp_path_factory):
-    """Every ``learn`` compiles its learner; here, and in the processes started here, only the first does."""
+    """Share compiled programs between all ``learn`` commands here, also those in other processes."""
     settings = {
         "jax_compilation_cache_dir": str(tmp_path_factory.mktemp("compiled")),
         "jax_persistent_cache_min_compile_time_secs": 0.0,
@@ -69,7 +74,7 @@ def compiled_once(tmp_path_factory):
 
 @pytest.fixture
 def house(tmp_path):
-    """A folder with an MDP, demonstrations, and the options that learn from them."""
+    """Make a folder with an MDP, demonstrations, and the options that learn from them."""
     save_mdp(tmp_path / "circle.npz", circle(), IN_VIEW)
     (tmp_path / "demos.jsonl").write_text("".join(LINES))
     return tmp_path
@@ -79,7 +84,7 @@ def options(folder, **changes) -> list[str]:
     """Arguments of ``learn`` in the folder, some changed or added."""
     values = {
         "mdp": folder / "circle.npz",
-        "demos": folder / "demos.jsonl",
+        "demonstrations": folder / "demos.jsonl",
         "journal": folder / "learned.db",
     } | changes
     return ["learn", *(str(x) for k, v in values.items() for x in (f"--{k.replace('_', '-')}", v))]
@@ -157,7 +162,7 @@ def test_the_version_is_printed():
 
 
 def numeric_options() -> list[tuple[list[str], str, bool]]:
-    """Every option that takes a number: its command, its name, and whether the number is whole."""
+    """List every option that takes a number: its command, its name, and whether the number is whole."""
     found = []
     for path in every_command():
         command = typer.main.get_command(app)
@@ -217,9 +222,17 @@ def test_bounds_names_the_range_of_what_is_outside(option, value, allowed):
 def test_bounds_answers_at_the_ends_of_its_ranges():
     for epsilon, features in (("1e-9", "1"), ("1e-9", "1000000"), ("0.94", "1")):
         asked = [
-            "bounds", "--epsilon", epsilon, "--features", features, "--predicates", "10000000",
-            "--steps", "10000000", "--json",
-        ]  # fmt: skip
+            "bounds",
+            "--epsilon",
+            epsilon,
+            "--features",
+            features,
+            "--predicates",
+            "10000000",
+            "--steps",
+            "10000000",
+            "--json",
+        ]
         answer = json.loads(call(*asked).stdout)
         assert all(row["trajectories"] >= 1 for row in answer["bounds"] + answer["perception"])
 
@@ -237,15 +250,34 @@ def test_what_is_simulated_can_be_read_and_learned_from(tmp_path):
     assert [(r.id, r.agent) for r in records] == [(f"patrol3-{i}-{a}", a) for i in range(3) for a in (0, 1)]
     assert all(r.demonstration.lengths.tolist() == [4] for r in records)
     again = call(
-        "simulate", "patrol", "--instance", 3, "--sessions", 3, "--steps", 4, "--seed", 5,
-        "--observability", 18,
-    ).stdout  # fmt: skip
+        "simulate",
+        "patrol",
+        "--instance",
+        3,
+        "--sessions",
+        3,
+        "--steps",
+        4,
+        "--seed",
+        5,
+        "--observability",
+        18,
+    ).stdout
     assert again == simulated
 
     # From standard input, the second patroller only; the table names the features.
     journal = tmp_path / "second.db"
     learned = call(
-        "learn", "--mdp", "patrol3", "--demos", "-", "--journal", journal, "--agent", 1, given=simulated
+        "learn",
+        "--mdp",
+        "patrol3",
+        "--demonstrations",
+        "-",
+        "--journal",
+        journal,
+        "--agent",
+        1,
+        given=simulated,
     )
     assert "3 sessions learned (0 were in" in learned.stdout
     shown = call("show", journal).stdout
@@ -290,7 +322,7 @@ def test_an_archive_s_view_is_used(house):
     (house / "lost.jsonl").write_text(
         '{"steps": [{"s": "north", "a": "on"}, null, {"s": "east", "a": "on"}]}\n'
     )
-    call(*options(house, demos=house / "lost.jsonl"))
+    call(*options(house, demonstrations=house / "lost.jsonl"))
 
 
 def test_the_history_is_exported_as_netcdf(house):
@@ -401,8 +433,8 @@ def test_a_name_of_ten_megabytes_is_cut_in_the_message(house):
         ({"mdp": "poor.npz"}, "poor.npz: an MDP archive misses the array 'probabilities'"),
         ({"mdp": "patrol2", "observability": 17}, r"patrol2 has no 17 % view; it has \[11, 18, 30"),
         ({"observability": 30}, "--observability is for the patrols; give an MDP file an in_view array"),
-        ({"demos": "absent.jsonl"}, "absent.jsonl: No such file or directory"),
-        ({"demos": "."}, r"\.: Is a directory"),
+        ({"demonstrations": "absent.jsonl"}, "absent.jsonl: No such file or directory"),
+        ({"demonstrations": "."}, r"\.: Is a directory"),
         ({"statistic": "all"}, "statistic must be one of seen, counts, features, got 'all'"),
         (
             {"solver": "simplex"},
@@ -418,7 +450,7 @@ def test_mistakes_in_the_options_are_told_in_one_line(house, monkeypatch, change
     np.savez(house / "poor.npz", successors=np.zeros((2, 1, 1), int))
     before = sorted(os.listdir(house))
     assert re.search(message, refused(*options(house, **changes)))
-    if "demos" in changes:
+    if "demonstrations" in changes:
         assert re.search(message, refused(*options(house, **changes), "--follow"))
     assert sorted(os.listdir(house)) == before  # a refused command leaves nothing behind
 
@@ -474,7 +506,7 @@ def test_an_unknown_option_is_a_mistake_of_usage(house):
 
 
 def test_an_interrupted_learner_says_what_is_safe_and_goes_on_when_run_again(house):
-    command = [*COMMAND, *options(house, demos="-"), "--json"]
+    command = [*COMMAND, *options(house, demonstrations="-"), "--json"]
     learner = subprocess.Popen(
         command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
     )
@@ -494,7 +526,7 @@ def test_an_interrupted_learner_says_what_is_safe_and_goes_on_when_run_again(hou
 def test_an_interrupt_that_python_swallows_comes_again():
     script = """
 import gc, sys, time
-from i2rl.analysis import cli
+from i2rl.analysis.command import app as cli
 
 def collecting(phase, info):  # JAX has such a callback, and Python goes on when Ctrl-C hits it
     gc.callbacks.remove(collecting)
@@ -605,9 +637,20 @@ def test_bounds_refuses_what_makes_no_sense(options, message):
 @pytest.mark.usefixtures("small_pictures")
 def test_the_patrol_study_writes_its_page(tmp_path, page_faults):
     result = call(
-        "run", "patrol", "--instance", 2, "--sessions", 3, "--trials", 4, "--runs", 1,
-        "--report", tmp_path / "report", "--json",
-    )  # fmt: skip
+        "run",
+        "patrol",
+        "--instance",
+        2,
+        "--sessions",
+        3,
+        "--trials",
+        4,
+        "--replications",
+        1,
+        "--folder",
+        tmp_path / "report",
+        "--json",
+    )
     assert json.loads(result.stdout) == json.loads((tmp_path / "report" / "results.json").read_text())
     page = (tmp_path / "report" / "index.html").read_text()
     assert page_faults(page) == []

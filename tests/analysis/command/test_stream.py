@@ -45,7 +45,7 @@ def round_trip() -> TabularMDP:
 
 
 def trajectory(seed: int, agent: int | None = None) -> str:
-    """A line about somebody who goes on, and half of the time waits in the kitchen."""
+    """Write a line about a walk that goes on, and half of the time waits in the kitchen."""
     rng = np.random.default_rng(seed)
     state, steps = int(rng.integers(5)), []
     for _ in range(4):
@@ -73,7 +73,7 @@ class Interrupted(Exception):
 
 
 def interrupted(lines: Iterable[str]) -> Iterator[str]:
-    """The lines, and then no end of the input but an interruption."""
+    """Yield the lines, and then an interruption instead of the input's end."""
     yield from lines
     raise Interrupted
 
@@ -311,13 +311,17 @@ BAD = [
 ]
 FEW = LineLimits(size=400, steps=20)
 REASONS = [
-    "not valid JSON", "unknown state 'attic'", "trajectory 0, step 1: ", "at most 400 bytes",
-    "at most 20 steps; it has 30", "trajectory [01], step 2: ",
-]  # fmt: skip
+    "not valid JSON",
+    "unknown state 'attic'",
+    "trajectory 0, step 1: ",
+    "at most 400 bytes",
+    "at most 20 steps; it has 30",
+    "trajectory [01], step 2: ",
+]
 
 
 def spoilt(lines: list[str]) -> list[str]:
-    """The lines, with a bad one after each of the first six."""
+    """Insert a bad line after each of the first six."""
     return [x for i, line in enumerate(lines) for x in (line, *BAD[i : i + 1])]
 
 
@@ -540,7 +544,7 @@ def test_a_killed_learner_loses_no_session_and_repeats_none(learner, lines, tmp_
     arguments = [
         "--mdp",
         str(tmp_path / "house.npz"),
-        "--demos",
+        "--demonstrations",
         str(tmp_path / "demos.jsonl"),
         "--seed",
         "3",

@@ -36,7 +36,7 @@ def _no_warnings():
 
 
 def drawn(figure: Figure) -> Figure:
-    """Rendered, so that whatever drawing raises or warns of shows."""
+    """Render the figure, so that errors and warnings of drawing show."""
     FigureCanvasAgg(figure).draw()
     return figure
 
@@ -66,9 +66,11 @@ def expert_policy(number: int):
     return instance(number).expert_policy()
 
 
-def curve(method: str, seeds: int = 3) -> figures.LearningCurve:
+def curve(method: str, replications: int = 3) -> figures.LearningCurve:
     rng = np.random.default_rng(0)
-    return figures.LearningCurve(method, np.arange(1, 21), rng.random((seeds, 20)), -rng.random((seeds, 20)))
+    return figures.LearningCurve(
+        method, np.arange(1, 21), rng.random((replications, 20)), -rng.random((replications, 20))
+    )
 
 
 @pytest.mark.parametrize("theme", style.THEMES, ids=lambda theme: theme.name)
@@ -212,12 +214,12 @@ def test_learning_curves_show_every_method_once(x_scale: str, theme: style.Theme
     np.testing.assert_allclose(left.lines[0].get_ydata(), np.median(curves[0].accuracy, axis=0))
     # A single run has no spread to show.
     assert len(left.collections) == 2
-    assert "middle 50% of 1 to 5 runs" in figure.get_supxlabel()
+    assert "middle 50% of 1 to 5 replications" in figure.get_supxlabel()
 
 
 def test_learning_curves_refuse_runs_of_another_length() -> None:
     short = curve("short")._replace(sessions=np.arange(3))
-    with pytest.raises(ValueError, match=r"short: runs of shape \(3, 20\) do not fit \(3,\)"):
+    with pytest.raises(ValueError, match=r"short: replications of shape \(3, 20\) do not fit \(3,\)"):
         figures.learning_curves([short])
 
 
@@ -251,7 +253,7 @@ def test_success_rates_show_rates_within_their_intervals() -> None:
     for p in left.collections[0].get_segments()[1][:, 0]:
         assert (0.5 - p) ** 2 == pytest.approx(1.959964**2 * p * (1 - p) / 20, rel=1e-5)
     assert [label.get_text() for label in left.get_yticklabels()] == ["all", "half"]
-    with pytest.raises(ValueError, match="odd: 3 successes and 2 time-outs of 4 runs"):
+    with pytest.raises(ValueError, match="odd: 3 successes and 2 time-outs of 4 replications"):
         figures.success_rates([figures.SuccessRate("odd", 3, 2, 4)])
 
 
@@ -305,10 +307,16 @@ SIGHTS = {
 
 
 def oklab(linear: np.ndarray) -> np.ndarray:
-    cones = [[0.4122214708, 0.5363325363, 0.0514459929], [0.2119034982, 0.6806995451, 0.1073969566],
-             [0.0883024619, 0.2817188376, 0.6299787005]]  # fmt: skip
-    axes = [[0.2104542553, 0.7936177850, -0.0040720468], [1.9779984951, -2.4285922050, 0.4505937099],
-            [0.0259040371, 0.7827717662, -0.8086757660]]  # fmt: skip
+    cones = [
+        [0.4122214708, 0.5363325363, 0.0514459929],
+        [0.2119034982, 0.6806995451, 0.1073969566],
+        [0.0883024619, 0.2817188376, 0.6299787005],
+    ]
+    axes = [
+        [0.2104542553, 0.7936177850, -0.0040720468],
+        [1.9779984951, -2.4285922050, 0.4505937099],
+        [0.0259040371, 0.7827717662, -0.8086757660],
+    ]
     return np.cbrt(np.clip(linear, 0, 1) @ np.transpose(cones)) @ np.transpose(axes)
 
 
@@ -325,21 +333,43 @@ def test_every_two_colours_of_methods_are_told_apart(theme: style.Theme, sight: 
 # Methods that share a panel.
 TOGETHER = [
     [patrol_study.ONLINE, patrol_study.FORGETFUL, patrol_study.BATCH, "batch LME, again after every session"],
-    ["Jin et al., table over states", "Jin et al., features", "DARKO, goals", "DARKO, windows of 5",
-     "ME-I2RL, features", "LME-I2RL, seen"],
+    [
+        "Jin et al., table over states",
+        "Jin et al., features",
+        "DARKO, goals",
+        "DARKO, windows of 5",
+        "ME-I2RL, features",
+        "LME-I2RL, seen",
+    ],
     list(sorting_study.METHODS.values()),
     [noisy_study.PLAIN, noisy_study.AVERAGED, noisy_study.STEPWISE, noisy_study.BARE],
     [noisy_study.ORACLE, noisy_study.OBSERVED, noisy_study.FAIR, noisy_study.CODED, noisy_study.ALL],
-    [noisy_study.PLAIN, noisy_study.AVERAGED, noisy_study.STEPWISE, noisy_study.FAIR, noisy_study.KNOWN,
-     noisy_study.CLEAR, noisy_study.ROBUST, noisy_study.MLIRL],
+    [
+        noisy_study.PLAIN,
+        noisy_study.AVERAGED,
+        noisy_study.STEPWISE,
+        noisy_study.FAIR,
+        noisy_study.KNOWN,
+        noisy_study.CLEAR,
+        noisy_study.ROBUST,
+        noisy_study.MLIRL,
+    ],
     [noisy_study.HIDDEN, noisy_study.BOTH],
     list(adversarial_results.METHODS),
     ["AIRL, clean input", "AIRL, noisy input", "robust-AIRL", "robust-AIRL, sensor learned", "LME-I2RL"],
     ["AIRL, noisy input", "robust-AIRL", "AIRL, noisy input, memory", "robust-AIRL, memory"],
-    ["i2rl", "i2rl, by level", "uniform", "frequencies", "frequencies of choices", "given entry",
-     "level and entry", "Markov"],
+    [
+        "i2rl",
+        "i2rl, by level",
+        "uniform",
+        "frequencies",
+        "frequencies of choices",
+        "given entry",
+        "level and entry",
+        "Markov",
+    ],
     ["BIRL", "MaxEnt"],
-]  # fmt: skip
+]
 
 
 @pytest.mark.parametrize("names", TOGETHER, ids=lambda names: names[0])

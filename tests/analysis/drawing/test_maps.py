@@ -19,7 +19,7 @@ CELLS = [(r, c) for r in range(N) for c in range(N)]
 
 
 def grid(copies: int = 1) -> TabularMDP:
-    """A walk on ``N x N`` cells, up, right, down and left."""
+    """Make a walk on ``N x N`` cells: up, right, down and left."""
     steps = ((-1, 0), (0, 1), (1, 0), (0, -1))
     inside = [[min(max(r + i, 0), N - 1) * N + min(max(c + j, 0), N - 1) for i, j in steps] for r, c in CELLS]
     successors = np.concatenate([np.array(inside) + N * N * k for k in range(copies)])[..., None]

@@ -109,16 +109,16 @@ def test_backticks_become_code_and_names_stay_names(tmp_path):
 
 
 def test_results_are_strict_json_and_say_where_they_come_from(tmp_path, monkeypatch):
-    monkeypatch.setattr(sys, "argv", ["/usr/bin/i2rl", "run", "patrol", "--report", "a folder"])
+    monkeypatch.setattr(sys, "argv", ["/usr/bin/i2rl", "run", "patrol", "--folder", "a folder"])
     values = {"share": np.array([0.5, np.nan]), "count": np.int64(3), "pair": (1.0, float("inf"))}
     page = written(tmp_path, [], results={"provenance": study_provenance(7), **values})
     content = json.loads((tmp_path / "results.json").read_text(), parse_constant=pytest.fail)
     assert (content["share"], content["count"], content["pair"]) == ([0.5, None], 3, [1.0, None])
     made = content["provenance"]
-    assert made["command"] == "i2rl run patrol --report 'a folder'"
+    assert made["command"] == "i2rl run patrol --folder 'a folder'"
     assert made["seed"] == 7
     assert made["versions"]["numpy"] == np.__version__
-    assert "i2rl run patrol --report &#x27;a folder&#x27;" in page
+    assert "i2rl run patrol --folder &#x27;a folder&#x27;" in page
     assert f"NumPy {np.__version__}".lower() in page.lower()
 
 

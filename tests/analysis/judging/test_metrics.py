@@ -199,12 +199,12 @@ def test_scores_refuse_undiscounted_processes() -> None:
 
 
 def test_a_band_holds_the_middle_of_the_runs() -> None:
-    runs = np.stack([np.arange(5.0), 10 * np.arange(5.0)], axis=1)[[3, 0, 4, 2, 1]]
-    band = metrics.quantile_band(runs)
+    replications = np.stack([np.arange(5.0), 10 * np.arange(5.0)], axis=1)[[3, 0, 4, 2, 1]]
+    band = metrics.quantile_band(replications)
     np.testing.assert_allclose(band.low, [1, 10])
     np.testing.assert_allclose(band.median, [2, 20])
     np.testing.assert_allclose(band.high, [3, 30])
-    wide = metrics.quantile_band(runs, 0.999)
+    wide = metrics.quantile_band(replications, 0.999)
     assert (wide.low < band.low).all()
     assert (wide.high > band.high).all()
 

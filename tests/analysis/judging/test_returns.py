@@ -209,7 +209,7 @@ def test_fishers_interval_covers_the_truth_as_often_as_it_says():
 
 
 def test_steps_of_a_trajectory_depend_on_each_other_and_the_bootstrap_knows():
-    """Both rewards share most of their trajectory's level, so that steps repeat what trajectories say."""
+    """Share most of a trajectory's level between both rewards, so that steps repeat the trajectory."""
     rng, rho, trajectories, steps, repeats = np.random.default_rng(3), 0.5, 40, 25, 150
     fisher = bootstrap = 0
     live = np.ones((trajectories, steps), bool)
@@ -307,8 +307,9 @@ def test_bounded_values_are_means_of_sigmoids():
     found = bounded_ile(demonstrated, short, generated, whole)
     pooled = np.concatenate([demonstrated[short], generated[whole]])
     scaled = (demonstrated - pooled.mean()) / pooled.std()
-    by_hand = np.mean([1 / (1 + np.exp(-scaled[i, : short[i].sum()])) @ np.ones(n) / n
-                       for i, n in enumerate(short.sum(1))])  # fmt: skip
+    by_hand = np.mean(
+        [1 / (1 + np.exp(-scaled[i, : short[i].sum()])) @ np.ones(n) / n for i, n in enumerate(short.sum(1))]
+    )
     assert found.demonstrated == pytest.approx(by_hand)
     assert 0 < found.generated < found.demonstrated < 1
     same = bounded_ile(demonstrated, short, demonstrated, short)
@@ -358,7 +359,7 @@ def test_of_nothing_lost_no_share_is_won_back(gained, share):
 
 
 def test_the_interval_over_few_seeds_covers_the_mean():
-    runs = np.random.default_rng(7).normal(3.0, 2.0, (5, 4000))
-    band = seed_interval(runs)
+    replications = np.random.default_rng(7).normal(3.0, 2.0, (5, 4000))
+    band = seed_interval(replications)
     assert abs(((band.low <= 3) & (band.high >= 3)).mean() - 0.95) < 0.015
-    assert np.isnan(seed_interval(runs[:1]).low).all()
+    assert np.isnan(seed_interval(replications[:1]).low).all()

@@ -49,7 +49,7 @@ def pictures(notebook: NotebookNode) -> list[str]:
 
 
 def made_notebook(tmp_path: Path, *sources: str, parameters: str = "SIZE = 3") -> Path:
-    """A notebook file with a cell of parameters and a code cell for each source."""
+    """Write a notebook file with a cell of parameters and a code cell for each source."""
     cells = [nbformat.v4.new_code_cell(parameters, metadata={"tags": ["parameters"]})]
     cells += [nbformat.v4.new_code_cell(source) for source in sources]
     path = tmp_path / "made.ipynb"

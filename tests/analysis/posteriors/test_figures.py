@@ -64,9 +64,10 @@ def stuck():
     weights[3, :, 2] = 1.7
     weights[:, :, 3] = 0.5
     return az.from_dict(
-        posterior={"weights": weights}, coords={"feature": ["well", "stuck [m/s]", "$still$", "_frozen"]},
+        posterior={"weights": weights},
+        coords={"feature": ["well", "stuck [m/s]", "$still$", "_frozen"]},
         dims={"weights": ["feature"]},
-    )  # fmt: skip
+    )
 
 
 def test_ranks_show_all_of_the_bars_of_a_stuck_chain(stuck):

@@ -37,7 +37,7 @@ class State(NamedTuple):
 
 @pytest.fixture(scope="module")
 def learner(mdp):
-    """Keeps the visits, and weighs a feature by how often it was collected."""
+    """Make a learner that accumulates visits and weighs a feature by its frequency."""
 
     def session(state, demonstration):
         pairs = jnp.zeros((mdp.n_states, mdp.n_actions)).at[demonstration.state, demonstration.action].add(1)
@@ -45,8 +45,17 @@ def learner(mdp):
         kept = blend(state.statistic, CountStatistic(jnp.array(float(n)), pairs / n))
         weights = jnp.einsum("sa,sak->k", kept.counts, mdp.features)
         number = state.session + 1
-        info = SessionInfo(number, -weights.sum(), -2 * weights.sum(), weights.max(), number, 3 * number,
-                        jnp.array(True), 0.1 * number, weights)  # fmt: skip
+        info = SessionInfo(
+            number,
+            -weights.sum(),
+            -2 * weights.sum(),
+            weights.max(),
+            number,
+            3 * number,
+            jnp.array(True),
+            0.1 * number,
+            weights,
+        )
         return State(kept, number), info
 
     def init(key):
@@ -165,9 +174,11 @@ def test_a_fleet_has_the_history_of_each_of_its_streams(mdp, learner):
     for i, key in enumerate(jax.random.split(jax.random.key(5), 2)):
         alone = run_history(learner, run_sessions(learner, streams[i], key=key))
         for group, name in (
-            ("sessions", "weights"), ("sessions", "log_likelihood"),
-            ("learned", "counts"), ("learned", "soft_policy"),
-        ):  # fmt: skip
+            ("sessions", "weights"),
+            ("sessions", "log_likelihood"),
+            ("learned", "counts"),
+            ("learned", "soft_policy"),
+        ):
             one = history[group][name].isel(run=i)
             np.testing.assert_allclose(one, alone[group][name], rtol=1e-6, atol=1e-9)
     with pytest.raises(ValueError, match="use fleet_history"):

@@ -74,7 +74,7 @@ def small(mdp):
 
 
 def extended(mdp, name, column):
-    """The same process with one more feature."""
+    """Return the same process with one more feature."""
     features = np.concatenate([np.asarray(mdp.features), np.asarray(column)[..., None]], axis=2)
     return with_features(mdp, features, (*mdp.feature_names, name))
 
@@ -130,7 +130,7 @@ def test_observed_information_against_enumeration(random_mdp, enumerate_completi
 
 
 def visits_of(mdp):
-    """Expected visits of each state in a trajectory."""
+    """Compute the expected visits of each state in a trajectory."""
     policy = jnp.exp(_log_policy(mdp, THETA))
     return finite_occupancy(mdp, jnp.broadcast_to(policy, (LENGTH, *policy.shape))).sum((0, 2))
 

@@ -46,13 +46,13 @@ def draws_of(weights):
 
 @pytest.fixture(scope="module")
 def sure():
-    """A posterior that is certain of the weights."""
+    """Make a posterior that is certain of the weights."""
     return draws_of(np.broadcast_to(WEIGHTS, (2, DRAWS, 2)))
 
 
 @pytest.fixture(scope="module")
 def demonstration(mdp, sensor):
-    """Simulated, with lost frames, unreported states and shorter trajectories."""
+    """Simulate, with lost frames, unobserved states and shorter trajectories."""
     codes = np.array(
         sample_demonstration(jax.random.key(5), TrajectoryLaw(mdp, WEIGHTS, sensor, LENGTH), 12).codes
     )

@@ -33,10 +33,14 @@ def ring():
     features[0, :, 0] = 1
     features[:, 1, 1] = 1
     return TabularMDP.from_successors(
-        successors, np.broadcast_to([0.8, 0.2], (6, 2, 2)), features, discount=0.8,
-        states=[f"cell {s}" for s in state], actions=("clockwise", "counterclockwise"),
+        successors,
+        np.broadcast_to([0.8, 0.2], (6, 2, 2)),
+        features,
+        discount=0.8,
+        states=[f"cell {s}" for s in state],
+        actions=("clockwise", "counterclockwise"),
         feature_names=("home", "turned"),
-    )  # fmt: skip
+    )
 
 
 @pytest.fixture(scope="module")
@@ -166,8 +170,11 @@ def test_the_sets_of_the_benchmark():
     patrol = instance(2)
     sets = feature_sets(patrol)
     assert {name: mdp.n_features for name, mdp in sets.items()} == {
-        "six": 6, "without moves": 5, "turns anywhere": 2, "without division 2": 5,
-    }  # fmt: skip
+        "six": 6,
+        "without moves": 5,
+        "turns anywhere": 2,
+        "without division 2": 5,
+    }
     assert set(RIVALS) < set(sets)
     dropped = set(patrol.mdp.feature_names) - set(sets["without moves"].feature_names)
     assert [float(patrol.weights[patrol.mdp.feature_names.index(n)]) for n in dropped] == [

@@ -95,7 +95,7 @@ def test_features_describe_the_step():
 
 
 def way_to(node):
-    """The nodes from below the root down to ``node``."""
+    """List the nodes from below the root down to ``node``."""
     path = [node]
     while path[0] != 0:
         path.insert(0, parent_of(path[0]))

@@ -32,7 +32,7 @@ TASKS = {"sorting": sorting_task, "patrol": patrol_task}
 
 
 def states_22() -> list[str]:
-    """The 22 states as digits (onion, prediction, hand), in the order of the process."""
+    """List the 22 states as digits (onion, prediction, hand), in the order of the process."""
     held = [f"3{p}3" for p in range(3)] + [f"1{p}1" for p in range(3)]
     return [f"0{p}{h}" for p in range(3) for h in range(4)] + held + [f"22{h}" for h in range(4)]
 
@@ -63,17 +63,24 @@ def table_of(noise: SwapNoise | FeatureNoise) -> np.ndarray:
 def test_sorting_predicates_say_what_their_names_say() -> None:
     task = sorting_task()
     assert task.predicates.shape == (8, 22, 7)
-    expected = np.array([
+    expected = np.array(
         [
             [
-                s[1] == "0", a in (TO_CONVEYOR, TO_BIN, PICK), s[0] == "0",
-                s[2] == "1" and a in (TO_CONVEYOR, TO_BIN, PICK), a == TO_BIN, a == TO_BIN, a == TO_CONVEYOR,
-                a == TO_CONVEYOR,
+                [
+                    s[1] == "0",
+                    a in (TO_CONVEYOR, TO_BIN, PICK),
+                    s[0] == "0",
+                    s[2] == "1" and a in (TO_CONVEYOR, TO_BIN, PICK),
+                    a == TO_BIN,
+                    a == TO_BIN,
+                    a == TO_CONVEYOR,
+                    a == TO_CONVEYOR,
+                ]
+                for a in range(7)
             ]
-            for a in range(7)
+            for s in states_22()
         ]
-        for s in states_22()
-    ]).transpose(2, 0, 1)  # fmt: skip
+    ).transpose(2, 0, 1)
     np.testing.assert_array_equal(task.predicates, expected)
 
 
@@ -85,9 +92,9 @@ def test_exactly_two_sorting_predicates_duplicate_others() -> None:
 
 def test_patrol_predicates_say_what_their_names_say_and_none_is_constant() -> None:
     task, states = patrol_task(), instance(2).states
-    expected = np.array([
-        [[a == FORWARD, a == LEFT, state.row == 0, a == RIGHT] for a in range(4)] for state in states
-    ]).transpose(2, 0, 1)  # fmt: skip
+    expected = np.array(
+        [[[a == FORWARD, a == LEFT, state.row == 0, a == RIGHT] for a in range(4)] for state in states]
+    ).transpose(2, 0, 1)
     np.testing.assert_array_equal(task.predicates, expected)
     among_the_expert = (task.predicates * task.pair_distribution("natural", 5)).sum((1, 2))
     assert ((among_the_expert > 0.01) & (among_the_expert < 0.99)).all()
@@ -150,10 +157,10 @@ def test_a_prediction_whose_opposite_is_no_state_is_reported_rightly() -> None:
 
 def test_noise_composes_with_a_view_and_passes_through_compilation() -> None:
     task = sorting_task()
-    view = Visibility(np.arange(22) % 3 != 0)
-    data = demonstrate_noisy(jax.random.key(0), task, sessions=10, view=view)
-    plain = log_evidence(view * task.noise, data.mdp, data.seen)
-    np.testing.assert_array_equal(log_evidence(task.noise * view, data.mdp, data.seen), plain)
+    visibility = Visibility(np.arange(22) % 3 != 0)
+    data = demonstrate_noisy(jax.random.key(0), task, sessions=10, visibility=visibility)
+    plain = log_evidence(visibility * task.noise, data.mdp, data.seen)
+    np.testing.assert_array_equal(log_evidence(task.noise * visibility, data.mdp, data.seen), plain)
     compiled = jax.jit(lambda noise: noise.noise.log_probabilities)(task.noise)
     np.testing.assert_allclose(np.exp(compiled), table_of(task.noise), atol=1e-12)
 
@@ -211,7 +218,7 @@ def test_agreement_of_the_patrol_is_one_less_the_noise_on_moves_and_right_turns(
 
 
 def exact_report_counts(task: NoisyTask, noise: SwapNoise | FeatureNoise, truth: np.ndarray) -> np.ndarray:
-    """Expected reports [S*A], given how often each truth [S*A] occurred."""
+    """Compute the expected observations [S*A], given how often each truth [S*A] occurred."""
     size = truth.size
     return truth @ table_of(noise).reshape(size, size)
 
@@ -371,13 +378,19 @@ def test_product_scores_are_equation_6_5(of: str) -> None:
 
 def test_sessions_scores_and_views_of_a_demonstration() -> None:
     task = patrol_task()
-    view = instance(2).visibility(30)
+    visibility = instance(2).visibility(30)
     data = demonstrate_noisy(
-        jax.random.key(9), task, sessions=4, trajectories=3, steps=5, view=view, scores="calibrated",
+        jax.random.key(9),
+        task,
+        sessions=4,
+        trajectories=3,
+        steps=5,
+        visibility=visibility,
+        scores="calibrated",
         starts="natural",
-    )  # fmt: skip
+    )
     assert [part.kind.shape for part in data.seen.sessions(3)] == [(3, 5)] * 4
-    in_view = np.asarray(view.in_view)[data.truth.state] == 1
+    in_view = np.asarray(visibility.in_view)[data.truth.state] == 1
     np.testing.assert_array_equal(data.seen.kind, np.where(in_view, SEEN, HIDDEN))
     np.testing.assert_array_equal(np.isnan(data.seen.score), ~in_view)
     unscored = demonstrate_noisy(

@@ -343,7 +343,7 @@ def test_values_stay_between_penalty_and_reward(seed):
 
 
 def standing_guard(*states):
-    """A patrol whose members never move from where they are."""
+    """Make a patrol whose members never move."""
     weights = -np.ones(6)
     assert (greedy_policy(PATROL.mdp, weights)[:, 1:3] == 0).all()
     still = jnp.zeros(S).at[jnp.array([patroller(*s) for s in states])].set(1 / len(states))
@@ -386,9 +386,13 @@ def test_who_underrates_the_guards_sight_is_caught():
     # The guard's own cell lies on the only way, so even a learner who thinks it blind stays.
     assert outcome.rate(TIMED_OUT) == 1
     outcome = breach_trials(
-        jax.random.key(0), standing_guard((10, 1, 1)), own_policies(open_way), settings=SURE,
-        planned_with=blind, **COMMON,
-    )  # fmt: skip
+        jax.random.key(0),
+        standing_guard((10, 1, 1)),
+        own_policies(open_way),
+        settings=SURE,
+        planned_with=blind,
+        **COMMON,
+    )
     assert outcome.rate(CAUGHT) == 1
 
 
@@ -403,18 +407,27 @@ def test_slow_learning_times_out():
     seconds = np.where(np.arange(COMMON["trials"]) < 5, 10.0, 500.0)
     patrol = standing_guard((16, 8, 2))
     outcome = breach_trials(
-        jax.random.key(0), patrol, own_policies(patrol), settings=SURE, learning_seconds=seconds,
-        threshold_seconds=200.0, **COMMON,
-    )  # fmt: skip
+        jax.random.key(0),
+        patrol,
+        own_policies(patrol),
+        settings=SURE,
+        learning_seconds=seconds,
+        threshold_seconds=200.0,
+        **COMMON,
+    )
     assert (outcome.ended == np.where(seconds > 200, TIMED_OUT, REACHED)).all()
 
 
 def test_leaving_at_random_times_out_half_of_the_time():
     patrol, n = standing_guard((16, 8, 2)), COMMON["trials"]
     outcome = breach_trials(
-        jax.random.key(0), patrol, own_policies(patrol), settings=SURE, go=GoAtRandom(),
+        jax.random.key(0),
+        patrol,
+        own_policies(patrol),
+        settings=SURE,
+        go=GoAtRandom(),
         **(COMMON | {"trials": n}),
-    )  # fmt: skip
+    )
     assert abs(outcome.rate(TIMED_OUT) - 0.5) <= 4 * np.sqrt(0.25 / n)
     assert np.isin(outcome.ended, [REACHED, TIMED_OUT]).all()
 

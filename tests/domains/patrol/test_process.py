@@ -31,10 +31,16 @@ from i2rl.models.observation.demonstration import HIDDEN, SEEN
 MAPS = {
     2: [".########", *[".#......."] * 15, ".########"],
     3: [
-        "#################.", "..........#.....#.", "....#######.....#.", "..........#.....#.",
-        "..........#.....#.", "..........#..####.", *["................#."] * 7, "..............###.",
+        "#################.",
+        "..........#.....#.",
+        "....#######.....#.",
+        "..........#.....#.",
+        "..........#.....#.",
+        "..........#..####.",
+        *["................#."] * 7,
+        "..............###.",
     ],
-}  # fmt: skip
+}
 INSTANCES = (1, 2, 3)
 
 
@@ -48,12 +54,12 @@ def index_of(patrol, *state):
 
 
 def follow(patrol, state, action):
-    """The state an action intends: the likelier of the listed successors."""
+    """Return the state that an action intends: the likelier of the listed successors."""
     return patrol.states[int(patrol.mdp.successors[index_of(patrol, *state), action, 0])]
 
 
 def expert_cycle(patrol, start, steps=200):
-    """The loop that the optimal policy settles into if every move succeeds."""
+    """Follow the optimal policy to its loop if every move succeeds."""
     policy = patrol.expert_policy().argmax(1)
     successors = np.asarray(patrol.mdp.successors)[..., 0]
     path = [start]
@@ -249,13 +255,23 @@ def test_break_ties_prefers_forward_then_right_then_left():
 @pytest.mark.parametrize(
     ("number", "observability", "cells", "share"),
     [
-        (1, 30, 6, 0.312), (1, 44, 9, None), (1, 100, 25, 1.0),
-        (2, 11, 2, 0.107), (2, 18, 4, 0.179), (2, 30, 8, 0.304), (2, 41, 13, 0.411), (2, 70, 22, 0.732),
+        (1, 30, 6, 0.312),
+        (1, 44, 9, None),
+        (1, 100, 25, 1.0),
+        (2, 11, 2, 0.107),
+        (2, 18, 4, 0.179),
+        (2, 30, 8, 0.304),
+        (2, 41, 13, 0.411),
+        (2, 70, 22, 0.732),
         (2, 100, 31, 1.0),
-        (3, 9, 4, 0.156), (3, 18, 8, 0.281), (3, 33, 15, 0.438), (3, 46, 21, 0.531), (3, 65, 30, 0.719),
+        (3, 9, 4, 0.156),
+        (3, 18, 8, 0.281),
+        (3, 33, 15, 0.438),
+        (3, 46, 21, 0.531),
+        (3, 65, 30, 0.719),
         (3, 100, 46, 1.0),
     ],
-)  # fmt: skip
+)
 def test_views_cover_the_stated_cells_and_share_of_the_loop(number, observability, cells, share):
     patrol = instance(number)
     view = patrol.views[observability]
@@ -298,7 +314,7 @@ def meetings(patrol, states):
 
 
 def expected_actions(patrol, states, interaction):
-    """What the passing rule makes of a joint walk, step by step; None where a patroller is free to act."""
+    """Apply the passing rule to a joint walk, step by step; None where a patroller is free to act."""
     meet, counter, rows = meetings(patrol, states), 0, []
     for t in range(states.shape[1]):
         if counter <= 0 and meet[t]:

@@ -18,7 +18,7 @@ TASKS = {"CartPole-v1": cart_pole(), "MountainCar-v0": mountain_car()}
 
 
 def _push_with_motion(rng, state):
-    """Builds up speed in the mountain car, so that the flag, the end of the track and both clips are met."""
+    """Build up speed in the mountain car, so that it meets the flag, the end of the track and both clips."""
     return int(rng.integers(3)) if rng.random() < 0.2 else (2 if state[1] > 0 else 0)
 
 

@@ -77,8 +77,9 @@ def test_steps_follow_the_rules():
     rng = np.random.default_rng(0)
     places = np.array([[0.45, 0.55, 1.1], [0.7, -0.5, 0.8], [0.75, 0.0, 0.77], [0.6, -0.4, 0.85]])
     n, stride, events = 400, 0.75, {"right": 0, "wrong": 0, "finished": 0, "held": 0}
-    wrists = np.clip(places[rng.integers(4, size=n)] + rng.normal(0, 0.1, (n, 3)),
-                     (0.2, -0.65, 0.75), (0.95, 0.70, 1.30))  # fmt: skip
+    wrists = np.clip(
+        places[rng.integers(4, size=n)] + rng.normal(0, 0.1, (n, 3)), (0.2, -0.65, 0.75), (0.95, 0.70, 1.30)
+    )
     onions = np.empty((n, 5, 4))
     onions[..., :3] = wrists[:, None] + rng.normal(0, rng.choice([0.02, 0.3], (n, 5, 1)), (n, 5, 3))
     onions[..., 3] = rng.integers(2, size=(n, 5))
@@ -214,7 +215,7 @@ def test_what_is_written_is_read(tmp_path, sorted_belts):
 
 
 def _check_facts(states, actions):
-    """What is true of every released recording: actions lead to the next wrist, and no onion is missorted."""
+    """Check every released recording: actions lead to the next wrist, and every onion is sorted correctly."""
     np.testing.assert_allclose(np.diff(states[:, 6:9], axis=0), STRIDE * actions[:-1], atol=1e-9)
     labels = states[:, 12::4]
     np.testing.assert_array_equal(labels[-1] == -1, labels[0] == 0)

@@ -21,7 +21,7 @@ def tally(behaviour: int, line: Line = Line(), *, seed: int = 0, belts: int = BE
 
 
 def agrees(counts: np.ndarray, expected: float) -> bool:
-    """Whether an exact expectation lies within four standard errors of a simulated mean."""
+    """Test whether an exact expectation lies within four standard errors of a simulated mean."""
     return abs(counts.mean() - expected) < 4 * counts.std(ddof=1) / np.sqrt(len(counts)) + 1e-12
 
 
@@ -39,9 +39,12 @@ def test_no_onion_is_lost(behaviour):
 def expected_of_picking(line: Line) -> np.ndarray:
     """Exact mean (TP, FP) of one set: onions are picked, inspected and placed until time is over."""
     seconds = {
-        "pick": line.pick_seconds, "inspect": line.inspect_seconds, "bin": line.place_seconds,
-        "back": line.place_seconds, "claim": line.claim_seconds,
-    }  # fmt: skip
+        "pick": line.pick_seconds,
+        "inspect": line.inspect_seconds,
+        "bin": line.place_seconds,
+        "back": line.place_seconds,
+        "claim": line.claim_seconds,
+    }
 
     @cache
     def ahead(phase: str, clock: float, bad: int, good: int, blemished: bool) -> tuple[float, float]:
@@ -52,7 +55,7 @@ def expected_of_picking(line: Line) -> np.ndarray:
         stays = np.array(ahead(phase, clock, bad, good, blemished)) * line.slip
 
         def claimed(phase: str) -> np.ndarray:
-            """A random other onion is claimed."""
+            """Claim a random other onion."""
             left, total = bad + good, np.zeros(2)
             if bad:
                 total += bad / left * np.array(ahead(phase, clock, bad - 1, good, True))
@@ -89,9 +92,11 @@ def expected_of_picking(line: Line) -> np.ndarray:
 def expected_of_rolling(line: Line) -> np.ndarray:
     """Exact mean (TP, FP) of one set: roll, then claim, pick and bin what is listed, and roll again."""
     seconds = {
-        "roll": line.roll_seconds, "pick": line.pick_seconds, "bin": line.place_seconds,
+        "roll": line.roll_seconds,
+        "pick": line.pick_seconds,
+        "bin": line.place_seconds,
         "claim": line.claim_seconds,
-    }  # fmt: skip
+    }
 
     def chance(k: int, n: int, p: float) -> float:
         return comb(n, k) * p**k * (1 - p) ** (n - k)

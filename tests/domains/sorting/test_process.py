@@ -29,9 +29,11 @@ S23 = (  # noqa: SIM905 (as printed)
 ).split()
 S26 = [*S23, "4202", "0212", "0232"]
 S22 = (
-    [f"0{p}{h}2" for p in range(3) for h in range(4)] + [f"3{p}32" for p in range(3)]
-    + [f"1{p}12" for p in range(3)] + [f"22{h}2" for h in range(4)]
-)  # fmt: skip
+    [f"0{p}{h}2" for p in range(3) for h in range(4)]
+    + [f"3{p}32" for p in range(3)]
+    + [f"1{p}12" for p in range(3)]
+    + [f"22{h}2" for h in range(4)]
+)
 STARTS = ["0200", "0220", "0100", "0110", "0120", "0130", "0210", "0230"]
 
 RAW_PIP = np.array([2, 1, 2, 1, 0.2, 0.1, 0, 4, 0, 0, 4])
@@ -81,11 +83,18 @@ A22 = {"empty": "", "none": "PN", "inspected": "CB"}
 def code_features(s: str, n: str) -> list[bool]:
     (o, p, _, ls), (o2, p2, h2, ls2) = s, n
     return [
-        p == "1" and o2 == "0", p == "0" and o2 != "0", p == "1" and o2 != "2", p == "0" and o2 == "2",
-        n != s, p2 == "2" and o2 == "0", ls == "0" and ls2 == "1",
-        o == "0" and p == "2" and p2 == "2" and h2 == "3", o == "0" and p == "0" and p2 == "0" and h2 == "3",
-        ls == "1" and ls2 == "0", o == "3" and p == "2" and p2 != "2",
-    ]  # fmt: skip
+        p == "1" and o2 == "0",
+        p == "0" and o2 != "0",
+        p == "1" and o2 != "2",
+        p == "0" and o2 == "2",
+        n != s,
+        p2 == "2" and o2 == "0",
+        ls == "0" and ls2 == "1",
+        o == "0" and p == "2" and p2 == "2" and h2 == "3",
+        o == "0" and p == "0" and p2 == "0" and h2 == "3",
+        ls == "1" and ls2 == "0",
+        o == "3" and p == "2" and p2 != "2",
+    ]
 
 
 def action_features(s: str, a: int, n: str) -> list[bool]:
@@ -127,7 +136,7 @@ def derived_mdp(states: list[str], which: str, coded: bool) -> TabularMDP:
 
 
 def choices(mdp: TabularMDP, states: list[str], weights: np.ndarray) -> dict[str, str]:
-    """The optimal action's letter in every state; fails on a tie."""
+    """Return the optimal action's letter in every state; fail on a tie."""
     optimal = np.asarray(_plan(mdp, weights).optimal)
     assert (optimal.sum(1) == 1).all()
     return dict(zip(states, (LETTERS[a] for a in optimal.argmax(1)), strict=True))
@@ -218,9 +227,20 @@ def test_true_weights():
 # -- what sorters do ----------------------------------------------------------------------------------
 
 FORCED = {
-    "3230": "I", "3232": "I", "1012": "B", "3031": "B", "1112": "C", "3130": "C", "2222": "N", "2221": "L",
-    "2220": "R", "0001": "P", "0021": "P", "0011": "P", "0031": "P",
-}  # fmt: skip
+    "3230": "I",
+    "3232": "I",
+    "1012": "B",
+    "3031": "B",
+    "1112": "C",
+    "3130": "C",
+    "2222": "N",
+    "2221": "L",
+    "2220": "R",
+    "0001": "P",
+    "0021": "P",
+    "0011": "P",
+    "0031": "P",
+}
 
 
 def policy_of(sorting: Sorting, behaviour: int) -> dict[str, str]:
@@ -349,20 +369,29 @@ def test_loopholes_of_outcome_features():
 # Expected features over 50 steps, theta . E, and mean value from the start, as printed.
 PRINTED = [
     (
-        sorting_without_claiming, PIP,
-        "7.067 6.885 7.938 6.541 47.5 14.157 0 13.66 0 0 13.367", "11.361", "23.651",
+        sorting_without_claiming,
+        PIP,
+        "7.067 6.885 7.938 6.541 47.5 14.157 0 13.66 0 0 13.367",
+        "11.361",
+        "23.651",
     ),
     (
-        sorting_without_claiming, RPP,
-        ".526 31.845 .526 15.356 47.453 .497 8.504 .014 15.693 7.678 0", "14.985", "31.237",
+        sorting_without_claiming,
+        RPP,
+        ".526 31.845 .526 15.356 47.453 .497 8.504 .014 15.693 7.678 0",
+        "14.985",
+        "31.237",
     ),
     (
-        sorting_with_claiming, PIP,
-        "7.041 6.885 7.938 6.541 47.5 6.735 0 13.653 0 0 13.367", "11.303", "23.549",
+        sorting_with_claiming,
+        PIP,
+        "7.041 6.885 7.938 6.541 47.5 6.735 0 13.653 0 0 13.367",
+        "11.303",
+        "23.549",
     ),
     (sorting_with_claiming, RPP, "0 31.845 .526 15.356 47.453 0 8.504 0 15.68 7.678 0", "14.981", "31.237"),
     (sorting_with_claiming, STAY, "0 0 .526 0 1.0 50 0 0 0 0 0", "50.0", "100.0"),
-]  # fmt: skip
+]
 
 
 def to_the_printed_digits(values, printed: str):

@@ -102,7 +102,7 @@ def test_without_noise_every_action_counts_once():
 
 
 def acted_out(environment, levels, length, steps=0):
-    """A policy acting with noise, in episodes that have lasted some steps already."""
+    """Run a policy with noise, in episodes that have lasted some steps already."""
     policy, critic = parts(environment)
     running = begin(environment, jax.random.key(1), len(levels))
     running = running._replace(steps=running.steps + steps)
@@ -201,7 +201,7 @@ def learner(agent):
 
 @pytest.fixture(scope="module")
 def demonstration():
-    """A pole balanced by pushing to where it falls."""
+    """Balance a pole by pushes towards its fall."""
     environment = cart_pole(100)
     step, observe = jax.jit(environment.step), jax.jit(environment.observe)
     observations, actions = [], []

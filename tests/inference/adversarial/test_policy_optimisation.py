@@ -113,7 +113,7 @@ def test_time_running_out_counts_the_value_of_what_would_follow_and_an_end_does_
 
 @pytest.mark.parametrize("environment", TASKS, ids=lambda e: e.name)
 def test_first_gradient_is_the_plain_policy_gradient(environment):
-    """Under the norm of collection all ratios are one, so the clipped objective is the likelihood's."""
+    """Check the likelihood's gradient: all ratios are one under the norm of collection."""
     agent, state = after_some_rounds(environment)
     _, rollout = agent.collect(state)
     flat = rollout.flat()
@@ -375,7 +375,7 @@ def test_learns_to_balance():
 
 
 def test_learns_continuous_actions_on_the_host():
-    """As good as a spring and a damper, set by hand, from the same first states."""
+    """Match a spring and a damper, set by hand, from the same first states."""
     slope, key = Slope(), jax.random.key(1)
     agent = ppo(slope, **{**SMALL, "epochs": 10}, learning_rate=3e-3, gamma=0.9)
     state = agent.init(jax.random.key(0))

@@ -25,7 +25,7 @@ COVARIANCE = 0.04
 
 
 def moved(state, action):
-    """A mass on a line, pushed: position and velocity."""
+    """Push a mass on a line: position and velocity."""
     position, velocity = state[..., 0], state[..., 1]
     velocity = 0.9 * velocity + 0.3 * action[..., 0]
     return jnp.stack([position + 0.3 * velocity, velocity], -1)
@@ -49,7 +49,7 @@ def task() -> Environment:
 
 @pytest.fixture(scope="module")
 def demonstration() -> Recording:
-    """A proportional controller brings the mass to rest."""
+    """Bring the mass to rest by a proportional controller."""
     state = jax.random.normal(jax.random.key(5), (6, 2))
     observations, actions = [], []
     for _ in range(50):

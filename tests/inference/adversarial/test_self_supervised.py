@@ -126,7 +126,7 @@ def slid(state, action):
 
 
 def slide(horizon: int, wall: float) -> Environment:
-    """A block pushed along; the reward is its place; beside it is something that does not matter.
+    """Push a block along; the reward is its place; an irrelevant component accompanies it.
 
     It ends at a wall on the left.
     """
@@ -142,7 +142,7 @@ def slide(horizon: int, wall: float) -> Environment:
 
 
 def place_reward(slope: float, absorbing: float):
-    """A state reward ``slope * place``."""
+    """Make a state reward ``slope * place``."""
     network = airl_discriminator(2, PUSH, state_only=True, reward=()).init(jax.random.key(0))
     chosen = (jnp.array([[slope], [0.0]], jnp.float32), jnp.float32(absorbing))
     return eqx.tree_at(lambda n: (n.reward.weights[0], n.absorbing), network, chosen)
@@ -197,7 +197,7 @@ def test_what_is_left_of_an_episode_that_ended_is_spent_in_the_absorbing_state(a
 
 @pytest.fixture(scope="module")
 def demonstration():
-    """An expert who pushes at half strength."""
+    """Record an expert who pushes at half strength."""
     rng = np.random.default_rng(0)
     observations, actions = [], []
     for _ in range(6):
@@ -212,9 +212,17 @@ def demonstration():
 @pytest.fixture(scope="module")
 def learner(agent):
     regression = Regression(
-        hidden=(32, 32), members=2, snippets=1000, shortest=5, longest=30, batch=32, iterations=500,
-        learning_rate=1e-3, penalty=1e-3, deviation=0.1,
-    )  # fmt: skip
+        hidden=(32, 32),
+        members=2,
+        snippets=1000,
+        shortest=5,
+        longest=30,
+        batch=32,
+        iterations=500,
+        learning_rate=1e-3,
+        penalty=1e-3,
+        deviation=0.1,
+    )
     return ssrr(
         agent,
         airl_discriminator(2, PUSH, state_only=True),

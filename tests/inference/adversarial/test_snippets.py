@@ -103,9 +103,16 @@ def test_a_linear_ensemble_finds_the_linear_reward():
     weights = np.array([1.0, -2.0, 0.5])
     ranked = linear_trajectories(weights, length=100, shortest=100)
     settings = Regression(
-        hidden=(), members=2, snippets=400, shortest=10, longest=40, iterations=1500, learning_rate=1e-2,
-        batch=32, penalty=0.0,
-    )  # fmt: skip
+        hidden=(),
+        members=2,
+        snippets=400,
+        shortest=10,
+        longest=40,
+        iterations=1500,
+        learning_rate=1e-2,
+        batch=32,
+        penalty=0.0,
+    )
     init, regress = snippet_regression(settings)
     reward = SSRRReward.create(jax.random.key(0), 3, settings)
     reward, _, fit = regress(reward, init(reward), ranked, jax.random.key(1))
@@ -118,9 +125,18 @@ def test_a_linear_ensemble_finds_the_linear_reward():
 @pytest.fixture(scope="module")
 def reduced():
     settings = Regression(
-        hidden=(32, 32), members=2, snippets=600, shortest=10, longest=60, points=20, iterations=400,
-        learning_rate=2e-3, batch=32, penalty=1e-3, deviation=0.2,
-    )  # fmt: skip
+        hidden=(32, 32),
+        members=2,
+        snippets=600,
+        shortest=10,
+        longest=60,
+        points=20,
+        iterations=400,
+        learning_rate=2e-3,
+        batch=32,
+        penalty=1e-3,
+        deviation=0.2,
+    )
     return settings, *snippet_regression(settings)
 
 

@@ -16,7 +16,7 @@ TWO = ActionSpace(2)
 
 
 def numbered(n: int, first: int = 0) -> Transitions:
-    """Steps that say in their observation which they are."""
+    """Make steps whose observations carry their numbers."""
     which = jnp.arange(first, first + n, dtype=jnp.float32)[:, None]
     return Transitions(which, jnp.zeros(n, jnp.int32), which, jnp.zeros(n, bool))
 

@@ -113,7 +113,7 @@ def committed(path: Path, learner: Toy, sessions: int) -> None:
 
 
 def bits(tree: Any) -> list[tuple]:
-    """Everything that tells two trees apart: containers, types, shapes and bits."""
+    """List everything that distinguishes two trees: containers, types, shapes and bits."""
 
     def of(leaf: Any) -> tuple:
         if isinstance(leaf, jax.Array) and jax.dtypes.issubdtype(leaf.dtype, jax.dtypes.prng_key):
@@ -165,9 +165,13 @@ leaves = st.one_of(
     numbers,
     numbers.map(lambda array: array.T),
     hnp.arrays(np.float64, 3).map(jnp.asarray),
-    st.none(), st.booleans(), st.integers(-(2**63), 2**64 - 1), st.floats(), st.text(max_size=4),
+    st.none(),
+    st.booleans(),
+    st.integers(-(2**63), 2**64 - 1),
+    st.floats(),
+    st.text(max_size=4),
     st.integers(0, 9).map(jax.random.key),
-)  # fmt: skip
+)
 trees = st.recursive(
     leaves,
     lambda inner: st.one_of(
@@ -664,7 +668,7 @@ def damaged(path: Path, *statements: str) -> None:
 
 @pytest.fixture
 def twelve(learner: Toy, tmp_path: Path) -> Path:
-    """A closed journal of twelve sessions."""
+    """Write a closed journal of twelve sessions."""
     with Journal.open(tmp_path / "j", learner) as journal:
         for state, report in learned(learner, 12):
             journal.commit(state, report, Position(state.session, "00"), bytes([state.session]))
@@ -711,7 +715,7 @@ NESTED = "printf('%.*c', 100000, '[')"
         ("UPDATE session SET number = 99 WHERE number = 12", "session 99 does not follow session 11"),
         ("PRAGMA user_version = 0", "journal version 0"),
     ],
-)  # fmt: skip
+)
 def test_damage_is_named_before_anything_is_shown_or_learned(
     statement: str, message: str, twelve: Path, learner: Toy
 ) -> None:
@@ -737,7 +741,7 @@ def test_damage_is_named_before_anything_is_shown_or_learned(
             "session 5 does not follow session 3",
         ),
     ],
-)  # fmt: skip
+)
 def test_a_wrong_history_is_not_shown_as_true(
     statement: str, message: str, twelve: Path, learner: Toy
 ) -> None:
@@ -790,7 +794,7 @@ def test_a_damaged_state_is_not_learned_on_from(
 
 
 def crafted(header: bytes, content: bytes = b"", length: int | None = None) -> bytes:
-    """A tree with this header, whose checksum is right."""
+    """Write a tree with this header and a right checksum."""
     body = b"i2rltree" + struct.pack("<I", len(header) if length is None else length) + header + content
     return body + hashlib.blake2b(body, digest_size=16).digest()
 
@@ -802,12 +806,19 @@ def entries(*leaves: Any) -> bytes:
 @pytest.mark.parametrize(
     "blob",
     [
-        b"", b"i2rltree", crafted(b""), crafted(b"[", length=2**32 - 1), crafted(b"{}"), crafted(b"7"),
-        crafted(b"[" * 100_000), crafted(entries("leaf")), crafted(entries(["a", "numpy", "<f8"])),
+        b"",
+        b"i2rltree",
+        crafted(b""),
+        crafted(b"[", length=2**32 - 1),
+        crafted(b"{}"),
+        crafted(b"7"),
+        crafted(b"[" * 100_000),
+        crafted(entries("leaf")),
+        crafted(entries(["a", "numpy", "<f8"])),
         crafted(entries(*[["a", "numpy", "<f8", []]] * (MOST_LEAVES + 1))),
         crafted(entries(["a", "numpy", "|u1", [1]], ["a", "numpy", "|u1", [1]]), bytes(2)),
     ],
-)  # fmt: skip
+)
 def test_bytes_that_nobody_encoded_are_refused_whatever_their_checksum(blob: bytes) -> None:
     with pytest.raises(ValueError, match="the bytes are damaged"):
         decode(blob)
@@ -816,15 +827,25 @@ def test_bytes_that_nobody_encoded_are_refused_whatever_their_checksum(blob: byt
 @pytest.mark.parametrize(
     ("leaf", "size"),
     [
-        ([["a"], "numpy", "<f8", []], 8), (["a", "object", "<f8", []], 8), (["a", "numpy", "|O", []], 8),
-        (["a", "numpy", "V8", []], 8), (["a", "numpy", "f8,f8", []], 16), (["a", "numpy", "rubbish", []], 8),
-        (["a", "numpy", "<f8", [-1]], 8), (["a", "numpy", "<f8", [2**70]], 8),
-        (["a", "numpy", "<f8", [2**39] * 2], 8), (["a", "numpy", "<f8", [True]], 8),
-        (["a", "numpy", "<f8", [1.0]], 8), (["a", "numpy", "<f8", [2]], 8),
-        (["a", "numpy", "<f8", [1]], 9), (["a", "numpy", "<f8", [1] * 33], 8), (["a", "text", "<f8", [1]], 8),
-        (["a", "python", "<f8", [1]], 8), (["a", "none", "|u1", [1]], 1),
+        ([["a"], "numpy", "<f8", []], 8),
+        (["a", "object", "<f8", []], 8),
+        (["a", "numpy", "|O", []], 8),
+        (["a", "numpy", "V8", []], 8),
+        (["a", "numpy", "f8,f8", []], 16),
+        (["a", "numpy", "rubbish", []], 8),
+        (["a", "numpy", "<f8", [-1]], 8),
+        (["a", "numpy", "<f8", [2**70]], 8),
+        (["a", "numpy", "<f8", [2**39] * 2], 8),
+        (["a", "numpy", "<f8", [True]], 8),
+        (["a", "numpy", "<f8", [1.0]], 8),
+        (["a", "numpy", "<f8", [2]], 8),
+        (["a", "numpy", "<f8", [1]], 9),
+        (["a", "numpy", "<f8", [1] * 33], 8),
+        (["a", "text", "<f8", [1]], 8),
+        (["a", "python", "<f8", [1]], 8),
+        (["a", "none", "|u1", [1]], 1),
     ],
-)  # fmt: skip
+)
 def test_a_leaf_that_nobody_encoded_is_refused_whatever_its_checksum(leaf: list, size: int) -> None:
     with pytest.raises(ValueError, match="the bytes are damaged"):
         decode(crafted(entries(leaf), bytes(size)))
@@ -875,7 +896,7 @@ PRAGMA user_version=1;
 
 
 def version_1(path: Path, learner: Toy, sessions: int) -> list[tuple[State, SessionInfo]]:
-    """A journal as version 1 wrote it."""
+    """Write a journal as version 1 wrote it."""
     history = learned(learner, sessions)
     connection = sqlite3.connect(path)
     connection.executescript(VERSION_1)
@@ -1075,13 +1096,17 @@ def test_a_log_cut_anywhere_leaves_whole_sessions(seed: int, learner: Toy, tmp_p
 
 @pytest.fixture(scope="module")
 def adversity(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
-    """What became of journals that were killed at every write, filled their disks, and were damaged."""
+    """Kill writers at every write, fill their disks, damage their journals, and collect the outcomes."""
     folder = tmp_path_factory.mktemp("adversity")
     options = ["--file-systems", "0", "--damaged", "150"]
     done = subprocess.run(
         [sys.executable, "-m", "i2rl.analysis.benchmarks.faults.journals", *options],
-        cwd=folder, capture_output=True, text=True, timeout=300, env=os.environ | {"JAX_PLATFORMS": "cpu"},
-    )  # fmt: skip
+        cwd=folder,
+        capture_output=True,
+        text=True,
+        timeout=300,
+        env=os.environ | {"JAX_PLATFORMS": "cpu"},
+    )
     assert done.returncode == 0, done.stdout + done.stderr
     found = json.loads((folder / "build" / "bench" / "journals.json").read_text())
     assert found.pop("problems") == []

@@ -134,7 +134,7 @@ def test_rate_and_radius_act_as_named(world):
 
 
 def impossible_pair(mdp):
-    """An action its state does not have, in arrays as large as the other sessions'."""
+    """Make an unavailable action of a state, in arrays as large as the other sessions'."""
     s, a = np.argwhere(~np.asarray(mdp.available))[0]
     return Demonstration.from_pairs([[s]], [[a]]).padded(2, 4)
 
@@ -175,8 +175,10 @@ def test_a_stream_is_cut_where_a_goal_is_reached():
     stream = Demonstration.from_pairs(states, actions)
     goals = np.isin(np.arange(5), [1, 4])
     sessions = list(goal_sessions(stream.sessions(), goals))
-    parts = [[(int(s), int(a)) for s, a in zip(d.state[0], d.action[0], strict=True) if s != UNKNOWN]
-             for d in sessions]  # fmt: skip
+    parts = [
+        [(int(s), int(a)) for s, a in zip(d.state[0], d.action[0], strict=True) if s != UNKNOWN]
+        for d in sessions
+    ]
     # Waiting in state 1 is no second arrival; what follows the last goal, (4, 6) on, is no session yet.
     assert parts == [[(3, 0), (0, 1)], [(1, 2), (1, 3), (2, 4)], [(1, 5)]]
     assert [d.kind.shape for d in sessions] == [(1, 2), (1, 4), (1, 1)]

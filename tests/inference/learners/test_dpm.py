@@ -44,14 +44,14 @@ def trajectories(demonstrate):
 
 @pytest.fixture(scope="module")
 def long_run(mdp, trajectories):
-    """Many sweeps of the sampler with moves wide enough to bounce off the box's walls."""
+    """Run many iterations of the sampler with moves wide enough to bounce off the box's walls."""
     return dpm_birl(
         mdp, rationality=ETA, alpha=ALPHA, iterations=8_000, proposals=1, updates=1, sigma=0.4
-    ).sample(jax.random.key(0), trajectories)  # fmt: skip
+    ).sample(jax.random.key(0), trajectories)
 
 
 def partitions(n):
-    """All partitions of ``n`` things, as labels by first appearance."""
+    """List all partitions of ``n`` things, as labels by first appearance."""
     found = [(0,)]
     for _ in range(n - 1):
         found = [(*p, label) for p in found for label in range(max(p) + 2)]
@@ -143,8 +143,9 @@ def test_weights_follow_the_posterior(long_run, enumerated):
 
 def test_the_joint_density_is_that_of_the_model(mdp, trajectories, long_run):
     counts = jnp.asarray(visit_counts(mdp, trajectories))
-    each = jax.jit(lambda w: jnp.diagonal(jax.vmap(
-        lambda x: boltzmann_log_likelihoods(mdp, x, counts, ETA))(w)))  # fmt: skip
+    each = jax.jit(
+        lambda w: jnp.diagonal(jax.vmap(lambda x: boltzmann_log_likelihoods(mdp, x, counts, ETA))(w))
+    )
     for sweep in (0, 17, 5000):
         labels, weights = long_run.labels[sweep], long_run.weights[sweep]
         expected = log_seating(labels, ALPHA) + (labels.max() + 1) * log(0.5) + each(weights).sum()

@@ -1,4 +1,4 @@
-"""Whether reports tell how good perception is, or the expert's errors could be the sensor's."""
+"""Identification of the sensor: whether the expert's errors could be the sensor's."""
 
 from __future__ import annotations
 

@@ -267,10 +267,11 @@ def test_any_other_schedule_has_the_units_of_the_number(mdp, sensor, demonstrati
     number, schedule = (
         run_sessions(
             lme_i2rl(mdp, sensor, statistic="features", slack=slack),
-            demonstration.select(slice(0, 16)).sessions(8), key=jax.random.key(0),
+            demonstration.select(slice(0, 16)).sessions(8),
+            key=jax.random.key(0),
         ).state.weights
         for slack in (0.02, lambda i: 0.02)
-    )  # fmt: skip
+    )
     assert np.allclose(number, schedule, atol=1e-12)
 
 
@@ -279,13 +280,19 @@ def test_every_solver_follows_a_schedule(mdp, sensor, demonstration):
     weights = [
         run_sessions(
             lme_i2rl(
-                mdp, sensor, solver=solver, statistic="features", slack=Harmonic(0.1), iterations=8,
+                mdp,
+                sensor,
+                solver=solver,
+                statistic="features",
+                slack=Harmonic(0.1),
+                iterations=8,
                 tolerance=1e-6,
             ),
-            few.sessions(8), key=jax.random.key(0),
+            few.sessions(8),
+            key=jax.random.key(0),
         ).state.weights
         for solver in ("newton", "ipopt", "cvxpy")
-    ]  # fmt: skip
+    ]
     assert np.allclose(weights[0], weights[1], atol=2e-4)
     assert np.allclose(weights[0], weights[2], atol=2e-4)
     simplex = me_i2rl(mdp, solver="exponentiated gradient", statistic="features", slack=Harmonic(0.1))
@@ -319,9 +326,11 @@ def test_a_schedule_resumes_from_a_journal_and_another_one_is_refused(mdp, senso
         rest = run_sessions(again, few.select(slice(4, 6)).sessions(2), journal=journal).state
         with pytest.raises(ValueError, match="another learner"):
             run_sessions(
-                lme_i2rl(mdp, sensor, slack=Harmonic(0.1)), few.sessions(), key=jax.random.key(0),
+                lme_i2rl(mdp, sensor, slack=Harmonic(0.1)),
+                few.sessions(),
+                key=jax.random.key(0),
                 journal=journal,
-            )  # fmt: skip
+            )
     assert np.array_equal(whole.weights, rest.weights)
 
 

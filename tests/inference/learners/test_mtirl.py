@@ -233,7 +233,7 @@ def test_identical_trajectories_are_one_way(sorting, batch):
 
 
 def unavailable(sorting):
-    """The fourth of five trajectories does, at its third step, what its state does not offer."""
+    """Give the fourth of five trajectories an unavailable action at its third step."""
     mixed = demonstrate_sorting(jax.random.key(0), sorting, (3, 2), STEPS).demonstration
     state, action = np.array(mixed.state), np.array(mixed.action)
     s = state[3, 2]

@@ -127,11 +127,13 @@ def test_what_is_hidden_as_well_is_summed_out():
     partly = [
         replace(
             x,
-            kind=np.where(hidden, HIDDEN, x.kind), state=np.where(hidden, -1, x.state),
-            action=np.where(hidden, -1, x.action), score=np.where(hidden, np.nan, x.score),
+            kind=np.where(hidden, HIDDEN, x.kind),
+            state=np.where(hidden, -1, x.state),
+            action=np.where(hidden, -1, x.action),
+            score=np.where(hidden, np.nan, x.score),
         )
         for x in seen
-    ]  # fmt: skip
+    ]
     state, report = learner.update(learner.init(KEY), partly[0])
     noise = FeatureNoise(task().features, np.asarray(jax.nn.sigmoid(state.logits)))
     law = TrajectoryLaw(mdp, state.weights, noise * view, 3)

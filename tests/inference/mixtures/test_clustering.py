@@ -1,4 +1,4 @@
-"""What a multi-task learner concludes."""
+"""Conclusions of a multi-task learner."""
 
 import numpy as np
 

@@ -265,7 +265,7 @@ def test_information_is_minus_the_hessian_where_visits_flow_as_the_policy_s(mdp)
         return jnp.sum(counts * jnp.where(mdp.available, log_policy, 0.0))
 
     step, gradient = 1e-5, jax.jit(jax.grad(log_likelihood))
-    hessian = np.stack([
-        (gradient(weights + step * e) - gradient(weights - step * e)) / (2 * step) for e in np.eye(3)
-    ])  # fmt: skip
+    hessian = np.stack(
+        [(gradient(weights + step * e) - gradient(weights - step * e)) / (2 * step) for e in np.eye(3)]
+    )
     np.testing.assert_allclose(count_information(mdp, counts, weights, plan.values), -hessian, atol=1e-6)

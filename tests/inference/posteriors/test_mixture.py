@@ -56,10 +56,12 @@ def sensor():
 @pytest.fixture(scope="module")
 def demonstration(mdp, sensor):
     """Three trajectories of each of two ways; some are hidden in places, a frame is lost, one is short."""
-    codes = np.concatenate([
-        np.asarray(simulated(jax.random.key(seed), mdp, jnp.array(w), sensor, 3))
-        for seed, w in ((2, [1.0, -3.0]), (3, [-1.0, 3.0]))
-    ])  # fmt: skip
+    codes = np.concatenate(
+        [
+            np.asarray(simulated(jax.random.key(seed), mdp, jnp.array(w), sensor, 3))
+            for seed, w in ((2, [1.0, -3.0]), (3, [-1.0, 3.0]))
+        ]
+    )
     codes[1, 2] = [3, -1, -1]
     codes[4, 4:] = [0, -1, -1]
     perceived, _ = perceive(mdp, sensor, codes)
@@ -84,13 +86,13 @@ def simulated(key, mdp, weights, sensor, n):
 
 @jax.jit
 def log_probabilities(mdp, weights, sensor, codes):
-    """Of each trajectory done in a way of its own."""
+    """Compute the log-probability of each trajectory under a component of its own."""
     return jax.lax.map(lambda x: TrajectoryLaw(mdp, x[0], sensor, LENGTH).log_prob(x[1]), (weights, codes))
 
 
 @jax.jit
 def log_likelihood(mdp, sensor, codes, sites):
-    """Of the declared model: its density without that of its prior."""
+    """Compute the likelihood of the declared model: its density without that of its prior."""
     options = {"components": len(sites["weights"]), "concentration": ALPHA, "prior": OPTIONS["prior"]}
     prior = ALPHA.log_prob(sites["concentration"]) + OPTIONS["prior"].log_prob(sites["weights"]).sum()
     prior += dist.Beta(1.0, sites["concentration"]).log_prob(sites["sticks"]).sum()
@@ -113,7 +115,7 @@ def partitions_of(n):
 
 
 def enumerate_partitions(mdp, sensor, demonstration, log_prior, axis):
-    """Every partition; each of its ways integrated over a grid of weights."""
+    """Enumerate the partitions; integrate each component over a grid of weights."""
     grid = jnp.stack(jnp.meshgrid(axis, axis, indexing="ij"), -1).reshape(-1, 2)
     perceived, rows = perceive(mdp, sensor, demonstration.codes)
     table = jax.jit(lambda w: component_log_likelihoods(mdp, soft_policies(mdp, w), perceived))(grid)
@@ -167,7 +169,7 @@ def weighed(partitions, log_evidence=0.0):
 
 
 def assert_mean(draws, expected, floor=1e-3):
-    """The mean of draws ``(chain, draw)`` is as expected, within Monte-Carlo error."""
+    """Check that the mean of draws ``(chain, draw)`` is as expected, within Monte-Carlo error."""
     draws = np.asarray(draws, float)
     if np.ptp(draws) == 0:
         assert draws.flat[0] == pytest.approx(float(expected), abs=5e-3)
@@ -273,7 +275,9 @@ def test_without_information_partitions_follow_the_process(demonstration, sensor
 
 
 def self_meeting():
-    """Expected sum of squared proportions: the probability that two more trajectories share a way."""
+    """Compute the expected sum of squared proportions: the chance that two more trajectories share a
+    component.
+    """
     return integrate.quad(lambda a: np.exp(float(ALPHA.log_prob(a))) / (1 + a), 0, 5)[0]
 
 

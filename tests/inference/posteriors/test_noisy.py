@@ -47,9 +47,16 @@ def demonstration(toy):
 def test_the_posterior_is_that_of_quadrature(toy, demonstration):
     priors = {"prior": dist.Normal(0.0, 2.0), "reliability_prior": dist.Beta(3.0, 1.5)}
     drawn = sample_noisy_posterior(
-        jax.random.key(0), toy, PREDICATES, demonstration, view=Visibility(VIEW), names=("edge",),
-        chains=2, draws=600, **priors,
-    )  # fmt: skip
+        jax.random.key(0),
+        toy,
+        PREDICATES,
+        demonstration,
+        view=Visibility(VIEW),
+        names=("edge",),
+        chains=2,
+        draws=600,
+        **priors,
+    )
     assert drawn.posterior.predicate.values.tolist() == ["edge"]
     problem, rows = noisy_problem(toy, PREDICATES, demonstration, view=Visibility(VIEW))
     theta, p = (x.ravel() for x in np.meshgrid(np.linspace(-8, 12, 61), (np.arange(60) + 0.5) / 60))

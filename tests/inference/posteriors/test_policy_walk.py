@@ -34,8 +34,9 @@ def grid(mdp, demonstration):
     points = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2)
     counts = jnp.asarray(visit_counts(mdp, demonstration))
     scaled = jnp.asarray(points / feature_scale(mdp))
-    total = jax.jit(lambda: jax.lax.map(
-        lambda w: boltzmann_log_likelihoods(mdp, w, counts, ETA).sum(), scaled))  # fmt: skip
+    total = jax.jit(
+        lambda: jax.lax.map(lambda w: boltzmann_log_likelihoods(mdp, w, counts, ETA).sum(), scaled)
+    )
     return points, np.asarray(total())
 
 

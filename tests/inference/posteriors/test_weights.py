@@ -41,9 +41,13 @@ def mdp():
     features[0, :, 0] = 1
     features[:, 1, 1] = 1
     return TabularMDP.from_dense(
-        transitions, features, discount=0.8,
-        states=("north", "east", "south", "west"), actions=("on", "back"), feature_names=("home", "turned"),
-    )  # fmt: skip
+        transitions,
+        features,
+        discount=0.8,
+        states=("north", "east", "south", "west"),
+        actions=("on", "back"),
+        feature_names=("home", "turned"),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +57,7 @@ def sensor():
 
 @pytest.fixture(scope="module")
 def demonstration(mdp, sensor):
-    """Simulated, with a lost frame, a shorter trajectory, and two that are wholly hidden."""
+    """Simulate, with a lost frame, a shorter trajectory, and two that are wholly hidden."""
     law = TrajectoryLaw(mdp, jnp.array([1.5, -1.0]), sensor, 5)
     codes = np.array(sample_demonstration(jax.random.key(5), law, 12).codes)
     codes[0, 2] = [3, -1, -1]
@@ -186,9 +190,15 @@ def test_draws_carry_names(idata, mdp, demonstration):
 def test_sampler_statistics_have_arviz_names(idata):
     stats = idata.sample_stats
     names = {
-        "lp", "energy", "acceptance_rate", "step_size", "n_steps",
-        "tree_depth", "reached_max_treedepth", "diverging",
-    }  # fmt: skip
+        "lp",
+        "energy",
+        "acceptance_rate",
+        "step_size",
+        "n_steps",
+        "tree_depth",
+        "reached_max_treedepth",
+        "diverging",
+    }
     assert names <= set(stats.data_vars)
     assert (stats.n_steps < 2**stats.tree_depth).all()
     assert np.isfinite(az.bfmi(idata)).all()

@@ -33,7 +33,7 @@ GRIDS = {2: simplex_grid(2, 4000), 3: simplex_grid(3, 200), 4: simplex_grid(4, 4
 
 
 def random_problem(rng):
-    """Counts far above, around and far below the strength; equal, nearly equal, or not at all."""
+    """Draw counts far above, around and far below the strength; equal, nearly equal, or not at all."""
     n_components = int(rng.integers(2, 5))
     counts = rng.gamma(rng.choice([0.2, 1.0, 5.0]), 1.0, n_components)
     if rng.random() < 0.5:
@@ -63,10 +63,13 @@ def test_the_optimum_is_that_of_a_general_solver():
         loss = jax.value_and_grad(lambda p, n=counts, s=strength: -entropic_objective(p, n, s))
         optimum = minimize(
             lambda p, loss=loss: tuple(np.asarray(part) for part in loss(jnp.asarray(p))),
-            np.full(4, 0.25), jac=True, method="SLSQP", bounds=[(1e-9, 1.0)] * 4,
+            np.full(4, 0.25),
+            jac=True,
+            method="SLSQP",
+            bounds=[(1e-9, 1.0)] * 4,
             constraints={"type": "eq", "fun": lambda p: p.sum() - 1, "jac": np.ones_like},
             options={"ftol": 1e-15, "maxiter": 500},
-        )  # fmt: skip
+        )
         assert optimum.success
         np.testing.assert_allclose(solve(counts, strength), optimum.x, atol=1e-6)
         assert float(objective(solve(counts, strength), counts, strength)) >= -optimum.fun - 1e-10

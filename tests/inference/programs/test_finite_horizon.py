@@ -182,7 +182,7 @@ def deterministic_mdp(seed: int, n_states: int = 4, n_actions: int = 2, n_featur
 
 
 def enumerate_trajectories(mdp: TabularMDP, horizon: int) -> tuple[list[list[tuple[int, int]]], np.ndarray]:
-    """Every trajectory of a deterministic process from state 0, and its feature sums ``f(X)``."""
+    """Enumerate the trajectories of a deterministic process from state 0, and their feature sums ``f(X)``."""
     paths = []
     for actions in itertools.product(range(mdp.n_actions), repeat=horizon):
         state, path = 0, []

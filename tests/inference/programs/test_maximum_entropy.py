@@ -292,10 +292,13 @@ def test_dependent_features_get_finite_weights_and_the_right_behaviour():
     constant = np.ones((*features.shape[:2], 1))
     nothing = 0 * constant
     mdp = TabularMDP.from_successors(
-        np.asarray(base.successors), np.asarray(base.probabilities),
+        np.asarray(base.successors),
+        np.asarray(base.probabilities),
         np.concatenate([features, features[..., :1] + features[..., 1:2], constant, nothing], -1),
-        initial=np.asarray(base.initial), discount=0.9, available=np.asarray(base.available),
-    )  # fmt: skip
+        initial=np.asarray(base.initial),
+        discount=0.9,
+        available=np.asarray(base.available),
+    )
     truth = random_weights(6)
     target = expert_target(mdp, np.concatenate([truth, np.zeros(3)]))
     behaviour = soft_policy(base, jnp.asarray(truth))
@@ -310,7 +313,7 @@ def test_dependent_features_get_finite_weights_and_the_right_behaviour():
 
 
 def session_targets(mdp, truth, n, seed=0):
-    """Running averages as sessions deliver them: the target settles while demonstrations come in."""
+    """Simulate running averages of sessions: the target settles while demonstrations come in."""
     rng = np.random.default_rng(seed)
     exact = expert_target(mdp, truth)
     return [
@@ -398,10 +401,14 @@ def test_a_fleet_of_learners_solves_as_each_would_alone():
 def test_a_target_no_policy_meets_is_refused_by_the_feature_s_name(slack):
     base = problem(10)
     mdp = TabularMDP.from_successors(
-        np.asarray(base.successors), np.asarray(base.probabilities), np.asarray(base.features),
-        initial=np.asarray(base.initial), discount=0.9, available=np.asarray(base.available),
+        np.asarray(base.successors),
+        np.asarray(base.probabilities),
+        np.asarray(base.features),
+        initial=np.asarray(base.initial),
+        discount=0.9,
+        available=np.asarray(base.available),
         feature_names=["speed", "comfort", "noise"],
-    )  # fmt: skip
+    )
     most = hard_plan(mdp, mdp.features[..., 1])
     best = expected_features(mdp, deterministic_policy(most.optimal))
     target = FeatureTarget(best.at[1].add(1.5), mdp.initial)

@@ -58,7 +58,7 @@ PRIORS = [Prior(), Prior(strength=0.0), Prior(0.5, 0.0, 0.2), Prior(2.0, 0.3, 0.
 
 
 def objective_of(mdp, counts, weights, proportions, prior):
-    """The marginal form, written independently; ``counts [D, n, S, A]``."""
+    """Compute the marginal form, written independently; ``counts [D, n, S, A]``."""
     policies = jnp.stack([log_policy(mdp, row) for row in weights])
     mixed = proportions > 0
     log_proportions = jnp.log(jnp.where(mixed, proportions, 1.0))
@@ -70,7 +70,7 @@ def objective_of(mdp, counts, weights, proportions, prior):
 
 
 def alternate(mdp, counts, shares, prior, sweeps=2000):
-    """Assignments, proportions and rewards in turn, until the objective stands still."""
+    """Update assignments, proportions and rewards in turn, until the objective stands still."""
     counts = np.broadcast_to(counts, (shares.shape[1], *counts.shape[-3:]))
     origin = WarmStart(jnp.zeros(mdp.n_features), jnp.zeros(mdp.n_states))
     warm, last = [origin] * shares.shape[1], -np.inf

@@ -26,7 +26,7 @@ def expected_agreement(predicates, reliabilities, weights, reportable=None):
 
 
 def dual(predicates, logits, weights, reportable, target, slack):
-    """The dual by summation over all pairs of pairs."""
+    """Compute the dual by summation over all pairs of pairs."""
     psi = predicates.reshape(len(predicates), -1)
     agree = psi[:, :, None] == psi[:, None]
     energies = np.tensordot(logits, agree, 1)[:, reportable.ravel()]

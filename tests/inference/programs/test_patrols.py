@@ -10,7 +10,7 @@ from i2rl.models import feature_expectations, reward_of, soft_plan
 
 @pytest.fixture(params=[1, 2, 3], scope="module")
 def problem(request):
-    """A patrol, weights a soft patroller might have, and its exact feature expectations."""
+    """Make a patrol, weights a soft patroller might have, and its exact feature expectations."""
     patrol = instance(request.param)
     weights = jnp.asarray(patrol.weights) * (20.0 if request.param == 1 else 1.5)
     policy = soft_plan(patrol.mdp, reward_of(patrol.mdp, weights)).policy

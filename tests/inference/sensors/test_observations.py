@@ -32,9 +32,9 @@ S, A = 4, 2
 SA = S * A
 VIEW = np.array([1.0, 0.4, 0.7, 0.0])
 # A predicate, a label, and a predicate that makes two pairs equal in everything.
-FEATURES = np.array([
-    [[0, 1], [0, 1], [0, 1], [0, 1]], [[0, 0], [0, 0], [1, 1], [2, 2]], [[1, 1], [1, 0], [0, 0], [1, 1]]
-])  # fmt: skip
+FEATURES = np.array(
+    [[[0, 1], [0, 1], [0, 1], [0, 1]], [[0, 0], [0, 0], [1, 1], [2, 2]], [[1, 1], [1, 0], [0, 0], [1, 1]]]
+)
 LOGITS = np.array([1.1, 0.6, -0.4])
 # One of the two equal pairs cannot be reported, nor can one that nothing equals.
 MASK = np.array([[0, 1], [1, 1], [1, 1], [0, 1]], bool)
@@ -42,11 +42,9 @@ EVERYTHING = np.ones((S, A), bool)
 MODES = ["none", "stepwise", "averaged"]
 ROWS = [
     [(SEEN, 0, 1, 0.8), (SEEN, 1, 0, 0.0), (SEEN, 2, UNKNOWN, 0.6), (HIDDEN, UNKNOWN, UNKNOWN, np.nan)],
-    [(SEEN, 1, 0, np.nan), (LOST, UNKNOWN, UNKNOWN, np.nan), (SEEN, UNKNOWN, 1, np.nan),
-     (SEEN, 2, 0, 0.3)],
-    [(SEEN, UNKNOWN, UNKNOWN, 0.9), (SEEN, 3, 1, 1.0), (SEEN, 1, 0, 0.55),
-     (PAD, UNKNOWN, UNKNOWN, np.nan)],
-]  # fmt: skip
+    [(SEEN, 1, 0, np.nan), (LOST, UNKNOWN, UNKNOWN, np.nan), (SEEN, UNKNOWN, 1, np.nan), (SEEN, 2, 0, 0.3)],
+    [(SEEN, UNKNOWN, UNKNOWN, 0.9), (SEEN, 3, 1, 1.0), (SEEN, 1, 0, 0.55), (PAD, UNKNOWN, UNKNOWN, np.nan)],
+]
 # Without those that leave something open, which are computed otherwise.
 NAMED = [
     [(kind, 2, 1, c) if kind == SEEN and UNKNOWN in (s, a) else (kind, s, a, c) for kind, s, a, c in row]
@@ -81,12 +79,12 @@ def tables(logits: np.ndarray, mask: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def by_class(classes, pairs: np.ndarray) -> np.ndarray:
-    """Sums ``[C]`` of ``[SA]``."""
+    """Sum ``[SA]`` by class to ``[C]``."""
     return np.bincount(np.asarray(classes.of_pair).ravel(), pairs.ravel(), len(classes.reportable))
 
 
 class Confidences(NamedTuple):
-    """Of a mode: what the functions take, and its value at each step and truth, NaN for a plain report."""
+    """Confidences of a mode: the functions' input, and its value at each step and truth, NaN for no score."""
 
     given: np.ndarray
     everywhere: np.ndarray
@@ -205,7 +203,7 @@ def test_unscored_evidence_is_that_of_noise_on_features(mask):
 
 
 def posterior(rows: list, mode: str, logits: np.ndarray, mask: np.ndarray) -> np.ndarray:
-    """Of the truth at each step, under an uneven prior."""
+    """Compute the posterior of the truth at each step, under an uneven prior."""
     joint = enumerated_evidence(rows, mode, logits, mask) * np.linspace(0.5, 2.0, SA)
     return joint / joint.sum(2, keepdims=True)
 
@@ -309,7 +307,7 @@ class Problem(NamedTuple):
         )
 
     def expected(self, logits: np.ndarray) -> np.ndarray:
-        """Matches of plain and wrong reports under these reliabilities."""
+        """Compute the matches of plain and wrong observations under these reliabilities."""
         plain, wrong = tables(logits, self.mask)
         joint = self.plain.sum(1)[:, None] * plain + self.wrong.sum(1)[:, None] * wrong
         return (agreements() * joint).sum((1, 2))
@@ -344,9 +342,14 @@ def problem(seed: int, mask: np.ndarray, scored: float = 0.6, clarity: float = 0
 
 def by_scipy(case: Problem, slack: float) -> np.ndarray:
     found = minimize(
-        case.dual, np.zeros(6), (slack,), jac=True, method="L-BFGS-B", bounds=[(0, LIMIT)] * 6,
+        case.dual,
+        np.zeros(6),
+        (slack,),
+        jac=True,
+        method="L-BFGS-B",
+        bounds=[(0, LIMIT)] * 6,
         options={"maxiter": 5000, "maxfun": 20000, "ftol": 1e-16, "gtol": 1e-11, "maxcor": 30},
-    )  # fmt: skip
+    )
     return found.x[:3] - found.x[3:]
 
 

@@ -275,7 +275,7 @@ FIVE = [np.array([i, 1]) for i in (3, 1, 1, 4, 2)]
 
 @pytest.fixture
 def begun(random_mdp, tmp_path):
-    """A function that runs a learner on a stream, in one journal; it has learned from three of five."""
+    """Return a function that runs a learner on a stream in one journal, after three of five sessions."""
     learner = Tally(random_mdp(0))
 
     def run(stream, **options):

@@ -1,4 +1,4 @@
-"""What users give: sensors, demonstrations and keys in any form, checked wherever there are numbers."""
+"""Users' inputs: sensors, demonstrations and keys in any form, checked wherever there are numbers."""
 
 from __future__ import annotations
 
@@ -77,7 +77,9 @@ WRONG = {
     "log-confusion of nan": (ObservationModel, np.full((1, 1, 1, 1), NAN), r"\(0, 0, 0, 0\) is nan"),
     "confusion": (ObservationModel.from_probabilities, np.ones((1, 2, 1, 2)), r"pair \(0, 0\) sum to 2"),
     "confused states": (
-        lambda x: ObservationModel.from_factors(x, np.eye(2)), [[0.9, 0.0], [0.0, 1.0]], r"sum to 0\.9"
+        lambda x: ObservationModel.from_factors(x, np.eye(2)),
+        [[0.9, 0.0], [0.0, 1.0]],
+        r"sum to 0\.9",
     ),
     "predicates": (lambda x: FeatureNoise(x, [0.9]), [[[0.5, 1.0]]], r"true or false, or whole numbers"),
     "reliabilities": (lambda x: FeatureNoise([[[True, False]]], x), [1.5], r"predicate 0 is 1\.5"),
@@ -90,7 +92,7 @@ WRONG = {
     "variance": (lambda x: GaussianSensor(1.0, x), -1.0, r"least eigenvalue is -1"),
     "chance of a shift": (lambda x: ShiftSensor(0.1, x), 1.5, r"must be in \[0, 1\], got 1\.5"),
     "shift": (ShiftSensor, np.inf, r"shift must be a finite number"),
-}  # fmt: skip
+}
 LIBRARIES = {"numpy": np.asarray, "jax": jnp.asarray, "python": lambda x: np.asarray(x).tolist()}
 
 

@@ -97,12 +97,22 @@ def test_a_page_shows_names_as_they_are(name):
 @pytest.mark.parametrize(
     ("value", "told"),
     [
-        (2214.0, "2,214"), (0.5, "0.5"), (0.99996, "1"), (999.7, "1,000"), (-0.01234, "-0.0123"), (0.0, "0"),
-        (float("nan"), "-"), (None, "-"), (float("inf"), "infinite"), (np.int64(12345), "12,345"),
-        (np.float64(3.14159), "3.14"), (1e-5, "1 × 10⁻⁵"), (2.5e12, "2.5 × 10¹²"),
+        (2214.0, "2,214"),
+        (0.5, "0.5"),
+        (0.99996, "1"),
+        (999.7, "1,000"),
+        (-0.01234, "-0.0123"),
+        (0.0, "0"),
+        (float("nan"), "-"),
+        (None, "-"),
+        (float("inf"), "infinite"),
+        (np.int64(12345), "12,345"),
+        (np.float64(3.14159), "3.14"),
+        (1e-5, "1 × 10⁻⁵"),
+        (2.5e12, "2.5 × 10¹²"),
         (999_000_000.0, "999,000,000"),
     ],
-)  # fmt: skip
+)
 def test_numbers_are_written_out(value, told):
     assert number(value) == told
 
@@ -119,10 +129,16 @@ def test_a_number_keeps_its_value_to_the_digits_asked_for(x):
 
 @pytest.mark.parametrize(
     ("n", "noun", "told"),
-    [(1, "seed", "1 seed"), (0, "run", "0 runs"), (3, "trajectory", "3 trajectories"),
-     (2, "breach", "2 breaches"), (2, "day", "2 days"), (2, "process", "2 processes"),
-     (1, "independent seed", "1 independent seed")],
-)  # fmt: skip
+    [
+        (1, "seed", "1 seed"),
+        (0, "run", "0 runs"),
+        (3, "trajectory", "3 trajectories"),
+        (2, "breach", "2 breaches"),
+        (2, "day", "2 days"),
+        (2, "process", "2 processes"),
+        (1, "independent seed", "1 independent seed"),
+    ],
+)
 def test_nouns_follow_their_count(n, noun, told):
     assert counted(n, noun) == told
 

@@ -29,7 +29,7 @@ def random_factors(seed, length=L):
 
 
 def log_space_likelihood(mdp, moves, factors):
-    """The forward recursion with logarithms throughout and nothing normalised."""
+    """Run the forward recursion in logarithms throughout, without normalisation."""
     with np.errstate(divide="ignore"):
         log_moves, alpha = np.log(moves), np.log(np.asarray(mdp.initial))
     for factor in np.asarray(factors):

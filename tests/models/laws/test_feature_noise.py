@@ -26,7 +26,7 @@ def random_reports(seed, n_predicates=3, shape=(4, 3)):
 
 
 def log_density(model, reliabilities):
-    """The model's density of reliabilities (not of their logits) and of the data."""
+    """Compute the model's density of reliabilities (not of their logits) and of the data."""
     point = {"reliability_logodds__": special.logit(reliabilities)}
     return float(model.compile_logp(jacobian=False, mode="FAST_COMPILE")(point))
 

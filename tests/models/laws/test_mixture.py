@@ -60,7 +60,7 @@ def simulated(key, mdp, sensor, n):
 
 @pytest.fixture(scope="module")
 def demonstration(mdp, sensor):
-    """Simulated, wholly seen rows among them, with lost frames, a short trajectory and a repeated one."""
+    """Simulate, wholly seen rows among them, with lost frames, a short trajectory and a repeated one."""
     codes = np.array(simulated(jax.random.key(1), mdp, sensor, 7))
     codes[0, 1] = [3, -1, -1]
     codes[1, 2:] = [0, -1, -1]
@@ -85,13 +85,15 @@ def test_density_is_a_sum_over_every_assignment_and_every_completion(
     mdp, sensor, demonstration, policies, enumerate_completions
 ):
     evidence = np.asarray(log_evidence(sensor, mdp, demonstration))
-    table = np.array([
+    table = np.array(
         [
-            enumerate_completions(mdp, log_policy, e[:steps]).log_likelihood
-            for e, steps in zip(evidence, demonstration.lengths, strict=True)
+            [
+                enumerate_completions(mdp, log_policy, e[:steps]).log_likelihood
+                for e, steps in zip(evidence, demonstration.lengths, strict=True)
+            ]
+            for log_policy in np.asarray(policies)
         ]
-        for log_policy in np.asarray(policies)
-    ])  # fmt: skip
+    )
     proportions = [0.5, 0.5 * 0.25, 0.5 * 0.75]
     total = sum(
         np.prod([proportions[d] * np.exp(table[d, i]) for i, d in enumerate(ways)])

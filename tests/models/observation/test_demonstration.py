@@ -319,7 +319,7 @@ HIDDEN_DEMO = Demonstration.from_steps([[(0, 1), "hidden", (2, 0)], [(2, None), 
 
 
 def columns(fill):
-    """The states and actions of ``HIDDEN_DEMO`` with a value where there is none."""
+    """Return the states and actions of ``HIDDEN_DEMO``, with a value at hidden steps."""
     return [[0, fill, 2], [2, 0, fill]], [[1, fill, 0], [fill, 0, fill]]
 
 
@@ -523,10 +523,17 @@ def test_hostile_lines_are_refused_by_file_and_line_in_a_short_message(reader, l
 
 @pytest.mark.parametrize(
     "step",
-    [f'"{LONG}"', f'{{"s": "{LONG}"}}', f'{{"{LONG}": 1}}', f'{{"a": [{LONG.replace("x", "1,")}1]}}',
-     '{"s": ' + "1" * 4000 + "}", '{"s": 0, "score": ' + "1" * 4000 + "}", '{"s": "\\ud800\\u001b[31m"}'],
+    [
+        f'"{LONG}"',
+        f'{{"s": "{LONG}"}}',
+        f'{{"{LONG}": 1}}',
+        f'{{"a": [{LONG.replace("x", "1,")}1]}}',
+        '{"s": ' + "1" * 4000 + "}",
+        '{"s": 0, "score": ' + "1" * 4000 + "}",
+        '{"s": "\\ud800\\u001b[31m"}',
+    ],
     ids=range(7),
-)  # fmt: skip
+)
 def test_what_a_message_quotes_is_cut_and_escaped(step):
     with pytest.raises(DemonstrationError, match="log, line 1, step 1: ") as caught:
         read(f"[null, {step}]", source="log")

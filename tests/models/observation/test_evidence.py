@@ -31,7 +31,7 @@ def confusion(seed=0):
 
 
 def walk(**options):
-    """Action 0 stays, action 1 moves on: 0 to 1 to 2, where it ends. Starts in 0."""
+    """Build a process: action 0 stays, action 1 moves on: 0 to 1 to 2, where it ends. Starts in 0."""
     successors = np.array([[[0], [1]], [[1], [2]], [[2], [2]]])
     return TabularMDP.from_successors(
         successors, np.ones((S, A, 1)), np.zeros((S, A, 1)), initial=np.array([1.0, 0, 0]), **options
@@ -205,26 +205,39 @@ NAMED = walk(states=("bin", "table", "eye"), actions=("stay", "go"))
 MASKED = walk(available=np.array([[True, False], [True, True], [True, True]]))
 IMPOSSIBLE = {
     "cannot start there": (
-        Sensor(), NAMED, [(1, 0)],
+        Sensor(),
+        NAMED,
+        [(1, 0)],
         r"trajectory 0, step 0: .*: seen state 'table' \(1\), action 'stay' \(0\); the initial distribution",
     ),
     "no transition": (
-        Sensor(), NAMED, [(0, 1), (1, 0), (2, 0)],
+        Sensor(),
+        NAMED,
+        [(0, 1), (1, 0), (2, 0)],
         r"trajectory 0, step 2: .*: seen state 'eye' \(2\).*; no transition leads there",
     ),
     "no transition through a gap": (
-        Sensor(), MDP, [(0, 1), None, (0, 0)], r"step 2: .*seen state 0, action 0; no transition",
+        Sensor(),
+        MDP,
+        [(0, 1), None, (0, 0)],
+        r"step 2: .*seen state 0, action 0; no transition",
     ),
     "no action": (Sensor(), MASKED, [(0, 1)], r"step 0: .*; the action is not available there"),
     "seen out of view": (Visibility([0, 1, 1]), MDP, [(0, 0)], r"step 0: .*; the sensor excludes it"),
     "hidden in full view": (
-        Visibility([1, 1, 1]), MDP, ["hidden"], r"step 0: .*: hidden; every state is in view",
+        Visibility([1, 1, 1]),
+        MDP,
+        ["hidden"],
+        r"step 0: .*: hidden; every state is in view",
     ),
     "hidden where it could not be": (
-        Visibility([1, 1, 0]), MDP, [(0, 0), "hidden"], r"step 1: .*: hidden; no transition leads there",
+        Visibility([1, 1, 0]),
+        MDP,
+        [(0, 0), "hidden"],
+        r"step 1: .*: hidden; no transition leads there",
     ),
     "never confused": (NOISY, MDP, [(0, 0), {"s": 2}], r"step 1: .*: seen state 2; no transition"),
-}  # fmt: skip
+}
 
 
 @pytest.mark.parametrize("case", IMPOSSIBLE)

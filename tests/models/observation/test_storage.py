@@ -56,8 +56,13 @@ def test_digests_are_those_of_divided_starts_as_journals_keep_them():
         mdp = started(p)
         kept = hashlib.sha256()
         for leaf in (
-            mdp.successors, mdp.probabilities, mdp.features, p / p.sum(), mdp.discount, mdp.available,
-        ):  # fmt: skip
+            mdp.successors,
+            mdp.probabilities,
+            mdp.features,
+            p / p.sum(),
+            mdp.discount,
+            mdp.available,
+        ):
             array = np.ascontiguousarray(leaf)
             kept.update(f"{array.dtype}{array.shape}".encode() + array.tobytes())
         kept.update(repr((None, None, None)).encode())

@@ -59,7 +59,7 @@ def solver(request):
 
 
 def behaviour(mdp, weights):
-    """What a soft plan leads to, as one vector."""
+    """Compute the behaviour of a soft plan, as one vector."""
     plan = soft_plan(mdp, reward_of(mdp, weights))
     visits, to_go = occupancy(mdp, plan.policy), features_to_go(mdp, plan.policy)
     return jnp.concatenate([plan.values, plan.policy.ravel(), visits.ravel(), to_go.ravel()])
@@ -72,7 +72,7 @@ def worth(mdp, weights):
 
 
 def varied(function, mdp, x):
-    """A function at a point ``x``: weights, discount, and one direction of the probabilities."""
+    """Evaluate a function at a point ``x``: weights, discount, and one direction of the probabilities."""
     tilt = jnp.asarray(np.random.default_rng(9).normal(size=mdp.probabilities.shape))
     probabilities = mdp.probabilities * jnp.exp(x[3] * tilt)
     probabilities = probabilities / jnp.where(
@@ -83,7 +83,7 @@ def varied(function, mdp, x):
 
 
 def differences(function, x, step):
-    """Derivative of a function of a vector by central differences of fourth order."""
+    """Differentiate a function of a vector by central differences of fourth order."""
     columns = []
     for direction in np.eye(len(x)):
         f = [function(x + k * step * direction) for k in (-2, -1, 1, 2)]

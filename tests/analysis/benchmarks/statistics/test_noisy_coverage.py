@@ -1,4 +1,4 @@
-"""The coverage study of the joint posterior: its judge where the posterior is known, and three small runs."""
+"""Coverage study of the joint posterior: its judge on known posteriors, and three small replications."""
 
 import jax
 import numpy as np
@@ -31,10 +31,10 @@ def _conjugate_runs(number, spread=1.0, seed=0):
 
 
 def test_exact_posteriors_cover_as_they_say():
-    runs = 300
-    study = judge(("one", "other"), _conjugate_runs(runs))
+    replications = 300
+    study = judge(("one", "other"), _conjugate_runs(replications))
     found = report(study)
-    error = np.sqrt(0.9 * 0.1 / runs)
+    error = np.sqrt(0.9 * 0.1 / replications)
     for quantity in found["quantities"]:
         assert abs(quantity["covered"] - 0.9) < 3.5 * error, quantity
         assert quantity["from"] < quantity["covered"] < quantity["to"]
@@ -48,12 +48,12 @@ def test_exact_posteriors_cover_as_they_say():
 
 @pytest.mark.parametrize("spread", [0.5, 2.0])
 def test_posteriors_of_the_wrong_width_are_found_out(spread):
-    runs = 300
-    study = judge(("one", "other"), _conjugate_runs(runs, spread))
+    replications = 300
+    study = judge(("one", "other"), _conjugate_runs(replications, spread))
     # An interval so many times as wide holds this much of a normal distribution.
     expected = 1 - 2 * stats.norm.sf(spread * stats.norm.isf(0.05))
     share = study.covered.mean(0)
-    assert (abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / runs) + 0.01).all()
+    assert (abs(share - expected) < 4 * np.sqrt(expected * (1 - expected) / replications) + 0.01).all()
     assert report(study)["smallest_p"] < 1e-6
 
 
@@ -77,20 +77,20 @@ def test_bad_input_is_refused_in_its_own_terms():
         rank_among(np.zeros((4, 1)), np.zeros(1), 5)
     with pytest.raises(ValueError, match="at least one run"):
         judge(("one",), [])
-    with pytest.raises(ValueError, match="runs must be at least 1"):
+    with pytest.raises(ValueError, match="replications must be at least 1"):
         next(replicate(jax.random.key(0), corridor(), 0))
 
 
 def test_runs_are_of_the_declared_model_and_their_key():
     setting, sampling = corridor(), Sampling(warmup=60, draws=40)
     key = jax.random.key(3)
-    runs, again = (list(replicate(key, setting, 3, sampling)) for _ in range(2))
-    for one, other in zip(runs, again, strict=True):
+    replications, again = (list(replicate(key, setting, 3, sampling)) for _ in range(2))
+    for one, other in zip(replications, again, strict=True):
         for x, y in zip(one, other, strict=True):
             np.testing.assert_array_equal(x, y)
-    assert not np.array_equal(runs[0].truth, runs[1].truth)
+    assert not np.array_equal(replications[0].truth, replications[1].truth)
     n_weights, size = setting.mdp.n_features, len(setting.quantities)
-    for run in runs:
+    for run in replications:
         assert run.truth.shape == (size,)
         assert run.draws.shape == (2, 40, size)
         assert run.log_density.shape == (80,)
@@ -99,6 +99,6 @@ def test_runs_are_of_the_declared_model_and_their_key():
             weights, reliabilities = values[:n_weights], values[n_weights:-1]
             prior = stats.norm.logpdf(weights, scale=1.5).sum() + stats.beta.logpdf(reliabilities, 4, 1).sum()
             assert density == pytest.approx(values[-1] + prior, abs=1e-9)
-    study = judge(setting.quantities, runs)
+    study = judge(setting.quantities, replications)
     assert study.covered.shape == study.ranks.shape == study.r_hat.shape == study.ess.shape == (3, size)
     assert study.jointly_covered.shape == study.divergences.shape == (3,)

@@ -93,10 +93,12 @@ def hopper():
 @pytest.fixture(scope="module")
 def patrol():
     rng = np.random.default_rng(1)
-    runs = {name: np.clip(level / 2100 + rng.normal(0, 0.01, (6, 8)), 0, 1) for name, level in LEVELS.items()}
+    replications = {
+        name: np.clip(level / 2100 + rng.normal(0, 0.01, (6, 8)), 0, 1) for name, level in LEVELS.items()
+    }
     methods = {
         name: MethodResult(PAIRS, accuracy=x, breaches=x[:, -1] / 2, errors=(empirical_ile(0.9, 0.7),) * 3)
-        for name, x in runs.items()
+        for name, x in replications.items()
         if name != SSRR
     }
     return AdversarialResults("patrol", "5 % confusions", 6, "two cores", methods)
@@ -132,8 +134,12 @@ def test_learning_shows_each_methods_mean(hopper, patrol, theme):
 
 def test_recovery_shows_the_share_and_the_dissertations(hopper, patrol):
     (axes,) = recovery_plot([hopper, patrol], LIGHT).axes
-    points = {(float(x), int(y)) for line in axes.lines if len(line.get_xdata()) == 1
-              for x, y in [(line.get_xdata()[0], line.get_ydata()[0])]}  # fmt: skip
+    points = {
+        (float(x), int(y))
+        for line in axes.lines
+        if len(line.get_xdata()) == 1
+        for x, y in [(line.get_xdata()[0], line.get_ydata()[0])]
+    }
     late = {m: hopper.methods[m].returns[:, -2:].mean() for m in LEVELS}
     share = (late[ROBUST] - late[NOISY]) / (late[CLEAN] - late[NOISY])
     assert any(math.isclose(x, share) and y == 0 for x, y in points)
@@ -143,8 +149,10 @@ def test_recovery_shows_the_share_and_the_dissertations(hopper, patrol):
 
 def test_an_interval_without_an_end_is_shown_to_go_on(patrol):
     rng = np.random.default_rng(2)
-    methods = {m: r._replace(accuracy=rng.uniform(0.4, 0.6, (6, 8)) - 0.01 * i)
-               for i, (m, r) in enumerate(patrol.methods.items())}  # fmt: skip
+    methods = {
+        m: r._replace(accuracy=rng.uniform(0.4, 0.6, (6, 8)) - 0.01 * i)
+        for i, (m, r) in enumerate(patrol.methods.items())
+    }
     unclear = patrol._replace(methods=methods)
     assert unclear.recovery().lost < 1
     (axes,) = recovery_plot([unclear], LIGHT).axes
@@ -155,7 +163,7 @@ def test_an_interval_without_an_end_is_shown_to_go_on(patrol):
 def test_an_unknown_share_is_no_point_on_the_axis(patrol):
     level = {CLEAN: 0.8, NOISY: 0.9, ROBUST: 0.85}
     methods = {m: MethodResult(PAIRS, accuracy=np.full((1, 8), x)) for m, x in level.items()}
-    unclear = patrol._replace(methods=methods, seeds=1)
+    unclear = patrol._replace(methods=methods, replications=1)
     assert unclear.recovery().share == -math.inf
     figure = recovery_plot([unclear], LIGHT)
     (axes,) = figure.axes
@@ -167,7 +175,7 @@ def test_an_unknown_share_is_no_point_on_the_axis(patrol):
 
 def test_one_seed_has_no_interval_of_its_share(patrol):
     methods = {m: r._replace(accuracy=r.accuracy[:1]) for m, r in patrol.methods.items()}
-    rows = recovery_table(patrol._replace(methods=methods, seeds=1)).rows
+    rows = recovery_table(patrol._replace(methods=methods, replications=1)).rows
     assert rows[-1][1].endswith("(one seed, no interval)")
 
 
@@ -202,7 +210,7 @@ def test_beliefs_show_truth_reports_and_posterior(hopper, theme):
     assert [p.get_title(loc="left") for p in panels] == list(hopper.belief.names)
     for j, panel in enumerate(panels):
         drawn = [line.get_ydata() for line in panel.lines]
-        for array in (hopper.belief.truth, hopper.belief.reported, hopper.belief.mean):
+        for array in (hopper.belief.truth, hopper.belief.observed, hopper.belief.mean):
             assert any(np.array_equal(line, array[:, j]) for line in drawn)
     inside = np.mean((hopper.belief.low <= hopper.belief.truth) & (hopper.belief.truth <= hopper.belief.high))
     assert f"{inside:.0%} of the truth" in figure.get_supxlabel()
@@ -230,7 +238,7 @@ def test_cells_are_shown_where_they_are():
 
 
 def test_silhouettes_are_the_robots(hopper):
-    """Every point of a limb's outline is a radius away from the line between its ends."""
+    """Check that every outline point of a limb is a radius away from the line between its ends."""
     figure = frames_plot(hopper.frames, LIGHT, "Hopper")
     (strip,) = hopper.frames
     limbs = [p for p in figure.axes[0].patches if isinstance(p, Polygon)]
@@ -264,7 +272,7 @@ def test_a_strip_travels_as_far_as_the_robot():
 
 def test_learning_is_told_beside_table_7_3(hopper):
     table = learning_table(hopper)
-    assert list(table.headings) == ["method", "seeds", "LBA, %", "return", "dissertation"]
+    assert list(table.headings) == ["method", "replications", "LBA, %", "return", "dissertation"]
     rows = {row[0]: row for row in table.rows}
     assert rows["expert"][-2:] == ["2,900", "2,810"]
     assert [rows[m][-1] for m in LEVELS] == ["2,130", "702", "1,810", "2,050"]
@@ -302,7 +310,7 @@ def test_table_7_5_is_told_of_its_own_task_alone(patrol):
 def test_correlations_are_told_beside_table_7_4(hopper):
     rows = {row[0]: row for row in correlation_table(hopper).rows}
     assert [rows[m][-1] for m in LEVELS] == ["0.95", "0.87", "0.96", "0.81"]
-    assert rows[CLEAN][2] == "480"  # of two seeds
+    assert rows[CLEAN][2] == "480"  # of two replications
     one = hopper._replace(
         methods={CLEAN: hopper.methods[CLEAN]._replace(correlations=(hopper.scatters[CLEAN].correlation,))}
     )
@@ -377,11 +385,20 @@ def test_results_are_read_as_they_were_stored(hopper, patrol, tmp_path):
 @pytest.mark.parametrize(
     "text",
     [
-        "", "[" * 10**5, "1" * 5000, '{"kind": "Interval"}', '{"items": [[[], 1]]}', '{"items": 3}', "\xff",
-        '{"array": [1, 2], "shape": [1099511627776]}', '{"float": "x"}', '{"a": 1, "a": 2}', "{}",
+        "",
+        "[" * 10**5,
+        "1" * 5000,
+        '{"kind": "Interval"}',
+        '{"items": [[[], 1]]}',
+        '{"items": 3}',
+        "\xff",
+        '{"array": [1, 2], "shape": [1099511627776]}',
+        '{"float": "x"}',
+        '{"a": 1, "a": 2}',
+        "{}",
     ],
     ids=range(11),
-)  # fmt: skip
+)
 def test_damaged_results_are_refused_by_file(text, tmp_path):
     (tmp_path / "other.json").write_text(text, encoding="latin-1")
     with pytest.raises(StorageError, match=r"other\.json: not stored results: ") as caught:
@@ -393,8 +410,14 @@ def test_damaged_results_are_refused_by_file(text, tmp_path):
 def test_the_page_holds_everything(hopper, patrol, tmp_path, page_faults):
     page = write([patrol, hopper], tmp_path).read_text()
     assert page_faults(page) == []
-    for name in ("patrol-learning", "hopper-learning", "hopper-rewards", "hopper-belief", "hopper-frames",
-                 "recovery"):  # fmt: skip
+    for name in (
+        "patrol-learning",
+        "hopper-learning",
+        "hopper-rewards",
+        "hopper-belief",
+        "hopper-frames",
+        "recovery",
+    ):
         assert (tmp_path / f"{name}-light.png").exists()
         assert (tmp_path / f"{name}-dark.png").exists()
     assert page.count("data:image/png") == 2 * 6

@@ -25,7 +25,7 @@ from i2rl.models.observation.demonstration import PAD
 
 @pytest.fixture(scope="module")
 def streams():
-    return noisy_streams(instance(2), 0.3, runs=4, sessions=6)
+    return noisy_streams(instance(2), 0.3, replications=4, sessions=6)
 
 
 def test_misreports_are_the_two_confusions_as_often_as_stated(streams):
@@ -65,9 +65,11 @@ def results():
         for forgetting in (0.0, 1.0):
             for name, top in ((CLEAN_INPUT, 0.97), (NOISY, 0.97 - level / 4), (ROBUST, 0.96)):
                 noise[f"{name}, {level:g}, memory {forgetting:g}"] = {
-                    "level": level, "accuracy": curve(top), "success": rng.random(5).tolist(),
+                    "level": level,
+                    "accuracy": curve(top),
+                    "success": rng.random(5).tolist(),
                     "pairs": list(range(50, 1050, 50)),
-                }  # fmt: skip
+                }
     view = {
         f"{name}, {percent} %, memory {forgetting:g}": {
             "view": percent,

@@ -34,16 +34,16 @@ TRIALS, SESSIONS = 3, 2
 
 @pytest.fixture(scope="module")
 def told(tmp_path_factory):
-    """The folder of a tiny report, and the JSON printed with it."""
+    """Return the folder of a tiny page, and the JSON printed with it."""
     folder = tmp_path_factory.mktemp("report")
     small = partial(patrol_results, trials=TRIALS, iterations=3)
-    command = ["run", "robust-airl", "--domain", "patrol", "--seeds", "1", "--sessions", str(SESSIONS)]
+    command = ["run", "robust-airl", "--domain", "patrol", "--replications", "1", "--sessions", str(SESSIONS)]
     # Next to nothing is computed: compilation is what takes time.
     jax.config.update("jax_disable_most_optimizations", True)
     try:
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(adversarial_patrol, "patrol_results", small)
-            result = CliRunner().invoke(app, [*command, "--noise", "4", "--report", str(folder), "--json"])
+            result = CliRunner().invoke(app, [*command, "--noise", "4", "--folder", str(folder), "--json"])
     finally:
         jax.config.update("jax_disable_most_optimizations", False)
         jax.clear_caches()  # of slow programs
@@ -111,7 +111,7 @@ def test_reports_without_an_error_have_nothing_to_show():
     ],
 )
 def test_noise_that_cannot_be_is_refused(tmp_path, noise, message):
-    command = ["run", "robust-airl", "--domain", "patrol", "--noise", noise, "--report", str(tmp_path / "no")]
+    command = ["run", "robust-airl", "--domain", "patrol", "--noise", noise, "--folder", str(tmp_path / "no")]
     result = CliRunner().invoke(app, command)
     assert result.exit_code == 1, (result.stdout, result.exception)
     assert not result.stdout
@@ -119,10 +119,10 @@ def test_noise_that_cannot_be_is_refused(tmp_path, noise, message):
     assert not (tmp_path / "no").exists()
 
 
-@pytest.mark.parametrize(("seeds", "sessions", "what"), [(0, 2, "seed"), (1, 0, "session")])
-def test_counts_below_one_are_refused(seeds, sessions, what):
+@pytest.mark.parametrize(("replications", "sessions", "what"), [(0, 2, "seed"), (1, 0, "session")])
+def test_counts_below_one_are_refused(replications, sessions, what):
     with pytest.raises(ValueError, match=f"at least one {what}, got 0"):
-        patrol_results(seeds, sessions)
+        patrol_results(replications, sessions)
 
 
 def test_shares_of_few_seeds_stay_within_a_hundred_percent():

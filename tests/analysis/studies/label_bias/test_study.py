@@ -88,9 +88,15 @@ _WORLDS, _TRAJECTORIES = 8, 75
 def _in_every_world(mdps, weights, expert):
     stacked = label_bias._stacked(mdps)
     return label_bias._in_every_world(
-        jax.random.split(jax.random.key(3), len(mdps)), stacked, jnp.asarray(weights), 1.0, 0.99,
-        label_bias.EXPERTS.index(expert), steps=Setting().steps, n=_TRAJECTORIES,
-    )  # fmt: skip
+        jax.random.split(jax.random.key(3), len(mdps)),
+        stacked,
+        jnp.asarray(weights),
+        1.0,
+        0.99,
+        label_bias.EXPERTS.index(expert),
+        steps=Setting().steps,
+        n=_TRAJECTORIES,
+    )
 
 
 def test_optimal_experts_earn_the_most_there_is():
@@ -241,7 +247,7 @@ def test_the_command_writes_its_page(tmp_path, monkeypatch):
     )
     result = CliRunner().invoke(
         app,
-        ["run", "label-bias", "--worlds", str(_WORLDS), "--report", str(tmp_path), "--json"],
+        ["run", "label-bias", "--worlds", str(_WORLDS), "--folder", str(tmp_path), "--json"],
     )
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["worlds"] == _WORLDS

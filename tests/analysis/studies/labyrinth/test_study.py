@@ -40,7 +40,7 @@ NOTHING = np.zeros(MAZE.mdp.n_states, bool)
 
 
 def thirsty_weights():
-    """A mouse that dislikes turning, explores, and climbs towards the water port."""
+    """Return the weights of a mouse that dislikes turning, explores, and climbs towards the water port."""
     weights = dict.fromkeys(MAZE.mdp.feature_names, 0.0)
     weights |= {"turns round": -1.5, "goes deeper": 0.7, "reaches home": 1.0, "reaches the water port": 2.0}
     node = parent_of(WATER_PORT)
@@ -127,9 +127,13 @@ def test_tables_agree_with_hand_computation():
     assert by_name["level and entry"].bits[1] == pytest.approx(2.0)
     assert by_name["Markov"].bits[1] == pytest.approx(2.0)
     assert {n: p.parameters for n, p in by_name.items()} == {
-        "uniform": 0, "frequencies": 2, "frequencies of choices": 2, "given entry": 6, "level and entry": 36,
+        "uniform": 0,
+        "frequencies": 2,
+        "frequencies of choices": 2,
+        "given entry": 6,
+        "level and entry": 36,
         "Markov": 378,
-    }  # fmt: skip
+    }
 
 
 def test_forced_steps_teach_frequencies_but_not_frequencies_of_choices():
@@ -226,7 +230,7 @@ def test_the_command_writes_its_page(result, tmp_path, monkeypatch):
         "labyrinth",
         "--recording",
         str(recording),
-        "--report",
+        "--folder",
         str(tmp_path / "page"),
         "--json",
     ]

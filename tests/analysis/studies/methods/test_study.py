@@ -63,7 +63,9 @@ METHODS = ("Jin et al., features", "DARKO, goals", "LME-I2RL, seen")
 
 @cache
 def small_study():
-    return online_methods.methods_study(2, sessions=8, runs=1, seed=1, learning_rates=(0.3,), methods=METHODS)
+    return online_methods.methods_study(
+        2, sessions=8, replications=1, seed=1, learning_rates=(0.3,), methods=METHODS
+    )
 
 
 def test_every_method_is_measured_at_the_same_pairs():
@@ -95,14 +97,14 @@ def test_the_figure_shows_the_medians(theme):
 def test_run_methods_writes_a_page(tmp_path, monkeypatch, page_faults):
     monkeypatch.setattr(online_methods, "methods_study", lambda *_, **__: small_study())
     folder = tmp_path / "report"
-    shown = CliRunner().invoke(app, ["run", "methods", "--report", str(folder)])
+    shown = CliRunner().invoke(app, ["run", "methods", "--folder", str(folder)])
     assert shown.exit_code == 0, shown.output
     assert "DARKO" in shown.output
     page = (folder / "index.html").read_text()
     assert page.count("<table") == 4
     assert page_faults(page) == []
     assert "data:image/png" in page
-    result = CliRunner().invoke(app, ["run", "methods", "--report", str(folder), "--json"])
+    result = CliRunner().invoke(app, ["run", "methods", "--folder", str(folder), "--json"])
     content = json.loads(result.output)
     assert content == json.loads((folder / "results.json").read_text())
     assert content["pairs"][-1] == 40

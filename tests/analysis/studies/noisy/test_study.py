@@ -38,7 +38,7 @@ def task():
 @cache
 def small():
     return noisy_study.noisy_study(
-        "sorting", runs=2, sessions=2, seed=3, belts=8, draws=0, methods=("MLIRL, batch",)
+        "sorting", replications=2, sessions=2, seed=3, belts=8, draws=0, methods=("MLIRL, batch",)
     )
 
 
@@ -69,9 +69,9 @@ def test_mean_interval_holds_the_mean_as_often_as_it_says():
 
 
 def test_streams_are_the_demonstration_cut_into_runs_and_sessions():
-    key, runs, sessions = jax.random.key(4), 2, 2
-    streams = draw_streams(key, task(), runs=runs, sessions=sessions)
-    drawn = demonstrate_noisy(key, task(), sessions=runs * sessions, scores="calibrated")
+    key, replications, sessions = jax.random.key(4), 2, 2
+    streams = draw_streams(key, task(), replications=replications, sessions=sessions)
+    drawn = demonstrate_noisy(key, task(), sessions=replications * sessions, scores="calibrated")
     for i, session in enumerate(drawn.seen.sessions(2)):
         for ours, theirs in zip(streams.session(*divmod(i, sessions)), session, strict=True):
             np.testing.assert_array_equal(ours, theirs)
@@ -92,7 +92,7 @@ def test_learners_get_those_sessions_one_after_the_other(fed):
         state = 10 * state + jnp.sum(seen.state)
         return state, Noted(state[None], jnp.sum(truth.action)[None])
 
-    streams = draw_streams(jax.random.key(4), task(), runs=2, sessions=2)
+    streams = draw_streams(jax.random.key(4), task(), replications=2, sessions=2)
     learner = Learner("noting", streams.mdp, {}, lambda key: jnp.zeros((), int), None, session)
     entry = noisy_study._Entry(lambda mdp, task: learner, fed)
     weights, agreement, last = noisy_study._learned(jax.random.key(0), learner, streams, entry)
@@ -204,8 +204,8 @@ def test_strip_marks_every_report_and_every_truth(theme):
 def test_mistakes_are_named():
     with pytest.raises(ValueError, match="tasks are sorting, patrol; got 'laundry'"):
         noisy_study.noisy_study("laundry")
-    with pytest.raises(ValueError, match="runs must be at least 1, got 0"):
-        noisy_study.noisy_study("sorting", runs=0)
+    with pytest.raises(ValueError, match="replications must be at least 1, got 0"):
+        noisy_study.noisy_study("sorting", replications=0)
     with pytest.raises(ValueError, match=r"methods are RIMEO, no scores; .*; got 'AIRL'"):
         noisy_study.noisy_study("sorting", methods=("AIRL",))
 
@@ -215,7 +215,7 @@ def test_command_writes_its_page(tmp_path, monkeypatch):
     monkeypatch.setattr(
         noisy_study, "noisy_study", lambda name, **options: small()._replace(seed=options["seed"])
     )
-    options = ["--runs", "2", "--sessions", "2", "--seed", "5", "--report", str(tmp_path), "--json"]
+    options = ["--replications", "2", "--sessions", "2", "--seed", "5", "--folder", str(tmp_path), "--json"]
     result = CliRunner().invoke(app, ["run", "noisy-sorting", *options])
     assert result.exit_code == 0, result.output
     assert json.loads(result.stdout)["seed"] == 5

@@ -38,9 +38,9 @@ from i2rl.inference.learners.dpm import dpm_birl
 
 @cache
 def small():
-    """The quickest methods to compile, few and short trajectories."""
+    """Run the methods that compile fastest, on few and short trajectories."""
     return sorting_study.sorting_study(
-        2, (6,), runs=2, steps=20, methods=("dpm-birl", "em-mlirl"), belts=20, n_components=3, seed=3
+        2, (6,), replications=2, steps=20, methods=("dpm-birl", "em-mlirl"), belts=20, n_components=3, seed=3
     )
 
 
@@ -111,7 +111,7 @@ def test_a_behaviour_without_a_way_is_carried_out_as_its_trajectories_were_taken
         ({"counts": (8, 1)}, "2 tasks need at least 2 trajectories, one of each; got 1"),
         ({"counts": ()}, "at least one number of trajectories"),
         ({"n_components": 0}, "n_components must be at least 1, got 0"),
-        ({"runs": 0}, "runs must be at least 1"),
+        ({"replications": 0}, "replications must be at least 1"),
         ({"sessions": 9, "counts": (4, 8)}, "at most the 8 trajectories, got 9"),
         ({"methods": ("gail",)}, "methods are mme-mtirl, .*got 'gail'"),
         ({"methods": ()}, "at least one method"),
@@ -161,13 +161,19 @@ def test_flow_of_each_expert_is_its_routine():
     good, bad, binned = (INSPECTED, GOOD), (INSPECTED, BLEMISHED), (BIN, UNKNOWN)
     routine = {move: set(actions) for move, actions in picking.moves.items()}
     assert routine == {
-        (unknown, held): {PICK}, (held, good): {INSPECT}, (held, bad): {INSPECT},
-        (good, unknown): {PLACE_ON_CONVEYOR}, (bad, binned): {PLACE_IN_BIN}, (binned, unknown): {CLAIM_NEW},
-    }  # fmt: skip
+        (unknown, held): {PICK},
+        (held, good): {INSPECT},
+        (held, bad): {INSPECT},
+        (good, unknown): {PLACE_ON_CONVEYOR},
+        (bad, binned): {PLACE_IN_BIN},
+        (binned, unknown): {CLAIM_NEW},
+    }
     listed, carried = (TABLE, BLEMISHED), (HELD, BLEMISHED)
     assert {move: set(actions) for move, actions in rolling.moves.items()} == {
-        (listed, carried): {PICK}, (carried, binned): {PLACE_IN_BIN}, (binned, listed): {ROLL, CLAIM_LISTED},
-    }  # fmt: skip
+        (listed, carried): {PICK},
+        (carried, binned): {PLACE_IN_BIN},
+        (binned, listed): {ROLL, CLAIM_LISTED},
+    }
     assert {move: set(actions) for move, actions in claiming.moves.items()} == {
         (unknown, unknown): {CLAIM_NEW}
     }
@@ -222,11 +228,21 @@ def test_command_writes_its_page(tmp_path, monkeypatch, page_faults):
         return small()
 
     monkeypatch.setattr(sorting_study, "sorting_study", shared)
-    command = ["run", "sorting", "--trajectories", "6", "--runs", "1", "--method", "em-mlirl", "--steps"]
-    command += ["20", "--belts", "10", "--json", "--report", str(tmp_path)]
+    command = [
+        "run",
+        "sorting",
+        "--trajectories",
+        "6",
+        "--replications",
+        "1",
+        "--method",
+        "em-mlirl",
+        "--steps",
+    ]
+    command += ["20", "--belts", "10", "--json", "--folder", str(tmp_path)]
     result = CliRunner().invoke(app, command)
     assert result.exit_code == 0, result.output
-    assert (asked["counts"], asked["runs"], asked["steps"]) == ([6], 1, 20)
+    assert (asked["counts"], asked["replications"], asked["steps"]) == ([6], 1, 20)
     assert (asked["belts"], asked["methods"]) == (10, ("em-mlirl",))
     told = json.loads(result.stdout)
     assert told == json.loads((tmp_path / "results.json").read_text())
@@ -253,7 +269,7 @@ def test_command_writes_its_page(tmp_path, monkeypatch, page_faults):
     ],
 )
 def test_command_tells_mistakes_in_one_line(options, complaint, tmp_path):
-    result = CliRunner().invoke(app, ["run", "sorting", *options, "--report", str(tmp_path / "none")])
+    result = CliRunner().invoke(app, ["run", "sorting", *options, "--folder", str(tmp_path / "none")])
     assert result.exit_code != 0
     assert "Traceback" not in result.output
     assert complaint in " ".join(result.output.split())

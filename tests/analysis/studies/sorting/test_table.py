@@ -36,7 +36,9 @@ RELEASED = {
 
 @cache
 def table():
-    """True weights rescaled, the behaviours confused, one that never bins, and a method nobody published."""
+    """Tabulate true weights rescaled, the behaviours confused, one that never bins, and an unpublished
+    method.
+    """
     sorting = sorting_with_claiming()
     picking, rolling, claiming = sorting.weights
     learned = {
@@ -157,9 +159,11 @@ def test_the_figure_shows_both(theme):
     figure = sorting_table_plot(table(), theme=theme, title="Sorting")
     panels = figure.axes
     assert [p.get_title(loc="left") for p in panels] == [
-        "pick-inspect-place: precision", "pick-inspect-place: recall",
-        "roll-pick-place: precision", "roll-pick-place: recall",
-    ]  # fmt: skip
+        "pick-inspect-place: precision",
+        "pick-inspect-place: recall",
+        "roll-pick-place: precision",
+        "roll-pick-place: recall",
+    ]
     dots = [line for line in panels[1].lines if line.get_marker() == "o"]
     diamonds = [line for line in panels[1].lines if line.get_marker() == "D"]
     np.testing.assert_allclose(

@@ -54,7 +54,7 @@ def mdp(random_mdp) -> TabularMDP:
 
 @pytest.fixture(scope="module")
 def expert(mdp: TabularMDP) -> np.ndarray:
-    """A soft expert's log-policy."""
+    """Compute a soft expert's log-policy."""
     reward = jnp.asarray(np.random.default_rng(1).normal(size=mdp.available.shape) * 1.5)
     return np.asarray(soft_plan(mdp, reward).log_policy)
 
@@ -70,7 +70,7 @@ def sensor(mdp: TabularMDP, noise: Confusions) -> Sensor:
 
 
 def _watched(mdp, expert, sensor, n: int, seed: int = 0) -> tuple[Demonstration, Demonstration]:
-    """What happened, and what was reported."""
+    """Simulate a behaviour and its observation."""
 
     def one(key):
         act, look = jax.random.split(key)
@@ -158,7 +158,7 @@ def test_proximal_plan_is_the_best_against_its_own_objective(mdp, expert):
 
 
 def _as_if_watched_for_ever(learner: Learner, mdp: TabularMDP, expert: np.ndarray) -> TabularAdversarialState:
-    """The learner's state before its first session, knowing the expert's occupancy exactly."""
+    """Initialise the learner's state with the expert's exact occupancy."""
     state = learner.init(jax.random.key(0))
     weights = discounted_transitions(mdp, jnp.asarray(expert), state.statistic.starts)
     return state._replace(statistic=TransitionStatistic(jnp.array(1e12), weights, state.statistic.starts))

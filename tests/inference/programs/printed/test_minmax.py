@@ -32,7 +32,7 @@ def accuracy(assignments, labels=LABELS):
 
 
 class Tiny:
-    """Every trajectory of three steps in a process of two states and two actions, five of them shown."""
+    """Trajectories of three steps in a process of two states and two actions, five of them demonstrated."""
 
     def __init__(self, seed, n_components=2, shown=5):
         rng = np.random.default_rng(seed)
@@ -46,9 +46,13 @@ class Tiny:
 
     def value(self, assignments, laws=None, normaliser=None):
         return lagrangian(
-            self.space, assignments, self.laws if laws is None else laws,
-            self.normaliser if normaliser is None else normaliser, self.weights, self.row_multipliers,
-        )  # fmt: skip
+            self.space,
+            assignments,
+            self.laws if laws is None else laws,
+            self.normaliser if normaliser is None else normaliser,
+            self.weights,
+            self.row_multipliers,
+        )
 
     def slopes(self, value, step=1e-6):
         slopes = np.zeros((self.space.demonstrated, self.assignments.shape[1]))
