@@ -1,4 +1,4 @@
-"""Where the states of a process lie, so that pictures can show them: cells of a grid, points, or a graph."""
+"""Layouts of a process's states for pictures: cells of a grid, points, or a graph."""
 
 from __future__ import annotations
 
