@@ -1,4 +1,4 @@
-"""``i2rl run robust-airl`` on patrol: the report it writes, what it prints, and what it refuses."""
+"""``i2rl run robust-airl`` on patrol: its page, its output, and its errors."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def told(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     small = partial(patrol_results, trials=TRIALS, iterations=3)
     command = ["run", "robust-airl", "--domain", "patrol", "--replications", "1", "--sessions", str(SESSIONS)]
-    # Next to nothing is computed: compilation is what takes time.
+    # Compilation takes nearly all of the time.
     jax.config.update("jax_disable_most_optimizations", True)
     try:
         with pytest.MonkeyPatch.context() as patch:
