@@ -94,7 +94,7 @@ def model_distance(
     Raises ``ValueError`` for sensors without an observation model, or about different pairs.
     """
     if one.noise is None or other.noise is None:
-        raise ValueError("an imperfection without an observation model reports exactly: nothing to compare")
+        raise ValueError("both sensors must have observation models; a sensor without one observes exactly")
     tables = [np.asarray(x.noise.log_probabilities) for x in (one, other)]  # type: ignore[union-attr]
     if tables[0].shape != tables[1].shape:
         raise ValueError(f"the models are about pairs {tables[0].shape[:2]} and {tables[1].shape[:2]}")

@@ -60,8 +60,9 @@ def counted_reliabilities(
     if len(classes.vectors) != 2 ** len(noise.predicates) or np.ptp(classes.reportable) > 0:
         raise ValueError(
             f"of {2 ** len(noise.predicates)} combinations of the predicates' values "
-            f"{np.count_nonzero(classes.reportable)} can be reported, by {classes.reportable.min():g} to "
-            f"{classes.reportable.max():g} pairs: predicates are not independent, and reliabilities no shares"
+            f"{np.count_nonzero(classes.reportable)} can be observed, by {classes.reportable.min():g} to "
+            f"{classes.reportable.max():g} pairs: predicates must be independent for reliabilities to "
+            f"be shares"
         )
     p = noise.reliabilities
     right = jax.random.binomial(key, observations, p, (replications, len(p)))

@@ -163,8 +163,8 @@ def print_answer(answer: Answer, console: Console) -> None:
     if answer.informative is not None and answer.ignorance_nats < error:
         needed = answer.informative["trajectories"]
         console.print(
-            f"Knowing nothing (zero weights) is {answer.ignorance_nats:.4g} nats from this expert: an error "
-            "above that promises nothing.\nTo promise as much takes "
+            f"Zero weights are {answer.ignorance_nats:.4g} nats from this expert: a bound above that is "
+            "vacuous.\nAn informative bound takes "
             f"{needed['theorem']} trajectories by the theorem, {needed['exact completion']} with exact "
             f"completion, {needed['observed spread']} with the observed spread."
         )
@@ -188,7 +188,7 @@ def _print_perception(needed: pd.DataFrame, console: Console) -> None:
     table = Table(title="The same error under noisy perception")
     names = {"printed": "Theorem 6 of appendix E", "corrected": "corrected"}
     table.add_column("bound")
-    for name in ("trajectories", "draws of the hidden pairs", "reports of known truth", "their error"):
+    for name in ("trajectories", "draws of the hidden pairs", "observations of known truth", "their error"):
         table.add_column(name, justify="right")
     for row in needed.itertuples():
         draws = str(row.draws) if row.draws else "none"

@@ -253,7 +253,7 @@ def quantile_band(replications: Float[np.ndarray, "replications ..."], coverage:
     replications = np.asarray(replications, float)
     if replications.ndim < 1 or replications.shape[0] == 0:
         raise ValueError(
-            f"a band needs at least one run along the first axis, got shape {replications.shape}"
+            f"a band needs at least one replication along the first axis; got shape {replications.shape}"
         )
     if not 0 < coverage < 1:
         raise ValueError(f"coverage must lie in (0, 1), got {coverage}")

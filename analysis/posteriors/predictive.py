@@ -62,7 +62,7 @@ def predictive_visits(
     demonstration = _observed(idata) if demonstration is None else demonstration
     kind, state = np.asarray(demonstration.kind), np.asarray(demonstration.state)
     if not len(kind):
-        raise ValueError("the demonstration has no trajectories, so there is nothing to compare with")
+        raise ValueError("the demonstration must have trajectories to compare with; got none")
     counted = (kind != PAD) & (kind != LOST) & ~((kind == SEEN) & (state == UNKNOWN))
     flat = jnp.asarray(weights.values.reshape(-1, mdp.n_features))
     keys = jax.random.split(key, len(flat))

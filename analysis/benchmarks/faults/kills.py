@@ -362,7 +362,7 @@ def _survive(
     peace = content(folder / "peace.db")
     total = len(peace.sessions)
     if first.reports != total or not total:
-        raise RuntimeError(f"{first.reports} sessions were reported, but {total} are in the journal")
+        raise RuntimeError(f"{first.reports} sessions were printed, but {total} are in the journal")
     problems = []
     cached = run(folder / "cached.db")
     compiled = run(folder / "compiled.db", cached=False) if shares.get("compiling") else cached
@@ -439,7 +439,7 @@ def _problem(found: Content, peace: Content, before: int, reports: int) -> str:
     if [s[0] for s in found.sessions] != list(range(1, committed + 1)):
         return "its sessions are not numbered 1, 2, ..."
     if committed < before + reports:
-        return f"{before + reports} sessions were reported, only {committed} are there"
+        return f"{before + reports} sessions were printed, only {committed} are there"
     if found.sessions != peace.sessions[:committed]:
         return "its sessions differ from those learned in peace"
     if [s for s, _ in found.state] != ([committed] if committed else []):

@@ -171,7 +171,7 @@ def uniformity(ranks: Ranks, bins: int = 16) -> list[Uniformity]:
 def main(
     replications: Annotated[int, typer.Option(help="Simulated demonstrations.")] = 256,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
-    path: Annotated[Path, typer.Option(help="Where the JSON report goes.")] = Path(
+    path: Annotated[Path, typer.Option(help="File of the JSON results.")] = Path(
         "build/bench/calibration.json"
     ),
 ) -> None:

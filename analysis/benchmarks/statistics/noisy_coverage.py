@@ -320,7 +320,7 @@ def judge(quantities: tuple[str, ...], replications: Iterable[Run], kept: int = 
             )
         )
     if not rows:
-        raise ValueError("coverage is judged over at least one run")
+        raise ValueError("coverage is judged over at least one replication")
     covered, jointly, ranks, r_hat, ess, divergences = (np.array(x) for x in zip(*rows, strict=True))
     return CoverageStudy(quantities, covered, jointly, ranks, kept, r_hat, ess, divergences)
 

@@ -110,7 +110,7 @@ def test_a_behaviour_without_a_way_is_carried_out_as_its_trajectories_were_taken
         ({"tasks": 4}, "tasks must be 2 .* or 3 .* got 4"),
         ({"counts": (8, 1)}, "2 tasks need at least 2 trajectories, one of each; got 1"),
         ({"counts": ()}, "at least one number of trajectories"),
-        ({"n_components": 0}, "ways must be at least 1, got 0"),
+        ({"n_components": 0}, "n_components must be at least 1, got 0"),
         ({"replications": 0}, "replications must be at least 1"),
         ({"sessions": 9, "counts": (4, 8)}, "at most the 8 trajectories, got 9"),
         ({"methods": ("gail",)}, "methods are mme-mtirl, .*got 'gail'"),
@@ -248,7 +248,8 @@ def test_command_writes_its_page(tmp_path, monkeypatch, page_faults):
     assert told == json.loads((tmp_path / "results.json").read_text())
     assert [m["method"] for m in told["methods"]] == ["DPM-BIRL", "EM-MLIRL"]
     assert told["methods"][0]["trajectories"] == [6]
-    assert len(told["ways of the first run"]) == len(set(small().results[0].found.assignments.tolist()))
+    found = set(small().results[0].found.assignments.tolist())
+    assert len(told["components of the first replication"]) == len(found)
     page = (tmp_path / "index.html").read_text()
     assert page_faults(page) == []
     assert "EM-MLIRL" in page
@@ -262,7 +263,7 @@ def test_command_writes_its_page(tmp_path, monkeypatch, page_faults):
     [
         (["--trajectories", "8,many"], "whole numbers such as 8,16,32, or all, got '8,many'"),
         (["--trajectories", "1"], "2 tasks need at least 2 trajectories"),
-        (["--ways", "0"], "Input should be greater than or equal to 1"),
+        (["--components", "0"], "Input should be greater than or equal to 1"),
         (["--tasks", "5"], "Input should be less than or equal to 3"),
         (["--method", "gail"], "gail"),
         (["--sessions", "99"], "at most the"),
