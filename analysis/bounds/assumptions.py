@@ -41,7 +41,7 @@ class Bound(NamedTuple):
     Fields
     ------
     source, statement : str
-        The theorem's numbers, and what is bounded.
+        The theorem's numbers, and the bounded quantity.
     error : float
         The bound: nats per trajectory, or units of ``(1 - gamma) E[phi]`` for a lemma on constraints.
     confidence : float

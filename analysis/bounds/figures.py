@@ -1,4 +1,4 @@
-"""Pictures of the bounds: how much data an error costs, and how far a bound is from what happens."""
+"""Pictures of the bounds: data against error, and the looseness of a bound."""
 
 from __future__ import annotations
 

@@ -174,8 +174,8 @@ def learned_perception_coverage(
     """Theorem 6 with hidden pairs filled in under the learner's own weights, exactly.
 
     The learner believes in reliabilities that are all off by ``shift`` times ``epsilon_o``; -1 and 1 are
-    corners of what the theorem allows. It completes as LME-I2RL does: the premise about completions is not
-    known to hold. Raises ``ValueError`` for a ``shift`` outside [-1, 1].
+    corners of the theorem's range. It completes as LME-I2RL does: the premise about completions is not known
+    to hold. Raises ``ValueError`` for a ``shift`` outside [-1, 1].
     """
     if not -1 <= shift <= 1:
         raise ValueError(f"the theorem allows reliabilities off by epsilon_o, got {shift} times that")

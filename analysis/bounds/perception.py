@@ -91,8 +91,7 @@ def rimeo_constraint_bound(
 
     ``(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon_r = epsilon + epsilon_s + L |Psi| epsilon_o`` with
     probability at least ``max(0, 1 - delta - delta_s - delta_o)``, ``delta_o = 2 K |Psi| exp(-2 n_o
-    epsilon_o^2)``. The module says what is wrong with it; :func:`noisy_constraint_bound` is what can be
-    proved.
+    epsilon_o^2)``. The module states its faults; :func:`noisy_constraint_bound` is what can be proved.
     """
     lemma = lme_constraint_bound(size, draws, epsilon, epsilon_s, n_features)
     counted("predicates", perception.predicates), counted("longest", perception.longest)

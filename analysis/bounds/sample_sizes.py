@@ -51,7 +51,7 @@ def answer(
     features are those of an expert who softly obeys the patrol's true weights, and assumptions are checked
     against it. ``predicates`` and ``steps`` (both or none) are the ``|Psi|`` and ``L`` of noisy perception.
     Raises ``ValueError`` for numbers out of range, for neither ``features`` nor ``mdp``, for both ``mdp`` and
-    something that it decides, and for ``predicates`` without ``steps`` or the other way round.
+    a value that it determines, and for ``predicates`` without ``steps`` or the reverse.
     """
     if (predicates is None) != (steps is None):
         raise ValueError("noisy perception is described by --predicates and --steps: give both or neither")

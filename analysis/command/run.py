@@ -195,9 +195,7 @@ def run_sorting(
     ),
     as_json: Json = False,
 ) -> None:
-    """Learn the rewards of several ways to sort onions, their number and their trajectories, from mixed
-    demonstrations.
-    """
+    """Learn the components of onion sorting from mixed demonstrations: number, rewards and trajectories."""
     from ..studies.sorting import page as sorting_page
     from ..studies.sorting import study as sorting_study
 

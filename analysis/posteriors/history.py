@@ -1,7 +1,7 @@
 """Histories of learners as ArviZ ``InferenceData``.
 
 A learner's weights are point estimates, one a session, and no draws from anything, so they go into a group
-``sessions`` of their own (as in a journal's export), and what the learner ended with into a group
+``sessions`` of their own (as in a journal's export), and the learner's last estimates into a group
 ``learned``.
 """
 

@@ -49,7 +49,7 @@ class Direction(NamedTuple):
     kind : str
         One of the kinds named in this module.
     description : str
-        What it means, in terms of the features.
+        Its meaning, in terms of the features.
     exact : bool
         Whether it is exactly unidentified, as opposed to weakly determined.
     """

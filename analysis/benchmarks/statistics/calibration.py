@@ -1,8 +1,8 @@
 """Simulation-based calibration of the posterior (Talts et al. 2018).
 
-Weights drawn from the prior generate a demonstration, whose posterior is sampled. Over many replications
-the truth's rank among the draws is uniform if and only if model, NUTS and backward sampling agree: for
-every weight, for the log-likelihood, and for what the expert did out of view.
+Weights drawn from the prior generate a demonstration, whose posterior is sampled. Over many replications the
+truth's rank among the draws is uniform if and only if model, NUTS and backward sampling agree: for every
+weight, for the log-likelihood, and for the expert's behaviour out of view.
 
 Run as ``python -m i2rl.analysis.benchmarks.statistics.calibration``.
 """

@@ -70,7 +70,7 @@ def rerun(
 
 
 def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """Wall-clock seconds of a call, and what it returned."""
+    """Return the wall-clock seconds of a call, and its result."""
     began = time.perf_counter()
     result = function(*arguments)
     return time.perf_counter() - began, result

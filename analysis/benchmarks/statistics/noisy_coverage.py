@@ -62,7 +62,7 @@ class NoisySetting(NamedTuple):
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Names of what is judged: every weight, every reliability, and the log-likelihood."""
+        """Names of the judged quantities: every weight, every reliability, and the log-likelihood."""
         weights = (f"weight of {name}" for name in self.mdp.feature_names)
         return (*weights, *(f"reliability of {name}" for name in self.predicate_names), "log-likelihood")
 

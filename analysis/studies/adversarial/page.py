@@ -288,7 +288,7 @@ def _printed_recovery(domain: str, method: str) -> float | None:
 
 
 def _tables(results: AdversarialResults) -> dict[str, Table]:
-    """Those that have rows, by what they are about."""
+    """Return the tables with rows, by their subject."""
     made = {
         "learning": learning_table(results),
         "recovery": recovery_table(results),

@@ -66,7 +66,7 @@ class MethodResult(NamedTuple):
     correlations : RewardCorrelation a seed, after the last session; or none
     errors : EmpiricalILE a seed, after the last session; or none
     breaches : float ``[replications]`` or None
-        Share of breaches of the patrol that succeed with what was learned in the end.
+        Share of successful breaches of the patrol with the final policy.
     seconds : float or None
         Median of a session, once compiled.
     """

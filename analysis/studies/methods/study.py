@@ -52,12 +52,12 @@ _TUNING = 7919
 
 
 def methods_table(mdp: TabularMDP, demonstration: Demonstration | None = None) -> pandas.DataFrame:
-    """Table 8.1 as it stands in this library: what each method's reward is and what it carries on.
+    """Table 8.1 as it stands in this library: each method's reward and memory.
 
-    One row per method, ``reward`` and ``statistic`` being what they are made of and ``reward numbers`` and
-    ``statistic numbers`` how many floats that is, counted in the learner's own state on ``mdp``. Random keys,
-    session counters and warm starts, which follow from the rest, are neither. With a ``demonstration``
-    batch LME is added as a contrast: it keeps every pair (two numbers) of what was seen so far.
+    One row per method: ``reward`` and ``statistic`` name the parts, ``reward numbers`` and ``statistic
+    numbers`` count their floats in the learner's own state on ``mdp``. Random keys, session counters and warm
+    starts, which follow from the rest, are neither. With a ``demonstration`` batch LME is added as a
+    contrast: it stores every pair seen so far (two numbers).
     """
     import pandas
 
@@ -170,11 +170,10 @@ def methods_study(
     """Run every method ``replications`` times on the same fully observed patrols, a stream a patroller.
 
     A stream is ``sessions`` windows of five pairs. Windows are the sessions of all methods but DARKO, whose
-    sessions end at the goals (:func:`turning_places`); what it learned at the last goal counts until the
-    next. Each learning rate is the :func:`chosen_rate` of ``learning_rates`` by their score (see
-    :class:`MethodsStudy`) on one further run, drawn for this and used for nothing else.
-    ``methods`` names some of the methods, all by default. Raises ``ValueError`` for an instance or a method
-    that does not exist.
+    sessions end at the goals (:func:`turning_places`); its state at the last goal counts until the next. Each
+    learning rate is the :func:`chosen_rate` of ``learning_rates`` by their score (see :class:`MethodsStudy`)
+    on one further replication, drawn for this purpose only. ``methods`` names some of the methods, all by
+    default. Raises ``ValueError`` for an instance or a method that does not exist.
     """
     patrol = instance(number)
     entries = _entries(patrol)

@@ -122,7 +122,7 @@ class Strip(NamedTuple):
 
     @property
     def believed(self) -> float:
-        """Mean posterior probability of what happened, over steps that were misreported; NaN without."""
+        """Mean posterior probability of the truth, over wrongly observed steps; NaN without."""
         wrong = (self.seen.state != self.truth.state) | (self.seen.action != self.truth.action)
         steps = np.flatnonzero(wrong[0])
         mass = self.posterior[steps, self.truth.state[0, steps], self.truth.action[0, steps]]

@@ -342,7 +342,7 @@ def _evaluated(
 
 
 def _stretch(key: jax.Array, patrol: Patrol, observability: int, weights: np.ndarray) -> Stretch:
-    """One round of a patroller that was not learned from, and what the learned weights say about it."""
+    """One round of a patroller outside the training data, and its posterior under the learned weights."""
     policy = jnp.log(jnp.asarray(patrol.expert_policy()))[None]
     first, walk, look = jax.random.split(key, 3)
     # Started in view, so that the first hidden gap lies between two sightings.

@@ -179,10 +179,10 @@ Place = tuple[int, int]
 
 
 class Flow(NamedTuple):
-    """A policy over places (where the onion is, what is thought of it) and actions.
+    """Policy over places (the onion's place and prediction) and actions.
 
     ``visits`` are shares of steps at each place; ``moves`` of steps that go from one place to another by an
-    action. Both leave out what is rare.
+    action. Both leave out rare transitions.
     """
 
     visits: dict[Place, float]
@@ -217,8 +217,8 @@ def flow_of(sorting: Sorting, policy: Float[np.ndarray, "S A"], steps: int) -> F
 def components_diagram(study: SortingStudy, theme: Theme) -> Figure:
     """Draw each component found as a state diagram of an onion, of the first method of the study.
 
-    Boxes are where the onion is and what is thought of it (hand and list left out); arrows are what the
-    greedy policy of the learned weights does.
+    Boxes are the onion's place and prediction (hand and list left out); arrows are the greedy policy of the
+    learned weights.
     """
     result, sorting = study.results[0], study.sorting
     sizes = np.bincount(result.found.assignments)

@@ -150,7 +150,7 @@ def test_what_cannot_be_compared_is_refused():
     with pytest.raises(ValueError, match="epsilon_o must be positive, got 0"):
         observation_distance(perception._replace(epsilon_o=0.0))
     noise = binary_noise([0.9, 0.9, 0.9])
-    with pytest.raises(ValueError, match="without an observation model"):
+    with pytest.raises(ValueError, match="both sensors must have observation models"):
         model_distance(noise, Visibility(np.ones(4)))
     with pytest.raises(ValueError, match="truths mark some of the pairs"):
         model_distance(noise, noise, np.zeros((4, 2), bool))
