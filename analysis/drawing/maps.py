@@ -1,4 +1,4 @@
-"""Pictures of a patrol on its floor: a policy in each state, and the belief about a hidden patroller."""
+"""Pictures of a patrol on its floor: what a policy does in each state, where a hidden patroller may be."""
 
 from __future__ import annotations
 
@@ -333,7 +333,7 @@ def _draw_strip(
 
 
 def corridors(cells: Sequence[Cell]) -> tuple[tuple[Cell, ...], ...]:
-    """Cells of a floor in walking order: the longest corridor, then the longest of the rest, and so on.
+    """Cells of a floor in walking order: the longest corridor, then the longest of what is left, and so on.
 
     A corridor is the longest of the shortest paths between two cells, by 4-neighbourhood.
     """

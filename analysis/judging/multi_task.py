@@ -155,7 +155,9 @@ def _contingency(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n
 def _weights(mdp: TabularMDP, which: str, weights: Float[np.ndarray, "D K"]) -> Float[np.ndarray, "D K"]:
     weights = np.asarray(weights, float)
     if weights.ndim != 2 or weights.shape[1] != mdp.n_features or not len(weights):
-        raise ValueError(f"{which} weights must have shape [n >= 1, {mdp.n_features}]; got {weights.shape}")
+        raise ValueError(
+            f"{which} weights must have shape [ways, {mdp.n_features}], at least one way, got {weights.shape}"
+        )
     if not np.isfinite(weights).all():
         component, k = np.argwhere(~np.isfinite(weights))[0]
         raise ValueError(

@@ -170,10 +170,11 @@ def methods_study(
     """Run every method ``replications`` times on the same fully observed patrols, a stream a patroller.
 
     A stream is ``sessions`` windows of five pairs. Windows are the sessions of all methods but DARKO, whose
-    sessions end at the goals (:func:`turning_places`); its state at the last goal counts until the next. Each
-    learning rate is the :func:`chosen_rate` of ``learning_rates`` by their score (see :class:`MethodsStudy`)
-    on one further replication, drawn for this purpose only. ``methods`` names some of the methods, all by
-    default. Raises ``ValueError`` for an instance or a method that does not exist.
+    sessions end at the goals (:func:`turning_places`); what it learned at the last goal counts until the
+    next. Each learning rate is the :func:`chosen_rate` of ``learning_rates`` by their score (see
+    :class:`MethodsStudy`) on one further run, drawn for this and used for nothing else.
+    ``methods`` names some of the methods, all by default. Raises ``ValueError`` for an instance or a method
+    that does not exist.
     """
     patrol = instance(number)
     entries = _entries(patrol)

@@ -71,7 +71,7 @@ def test_value_difference_says_what_does_not_fit():
     given = [sorting.mdp, sorting.weights, mixed.labels, sorting.weights, mixed.labels, mixed.demonstration]
     hidden = mixed.demonstration._replace(kind=np.array([[1, 1, 1], [1, 2, 1]], np.int8))
     for place, value, complaint in (
-        (3, sorting.weights[:, :4], r"learned weights must have shape \[n >= 1, 11\]"),
+        (3, sorting.weights[:, :4], r"learned weights must have shape \[ways, 11\]"),
         (3, np.full((2, 11), np.nan), "not a number"),
         (4, np.array([0, 3]), "between 0 and 2"),
         (2, np.array([0, 1, 1]), "each of 2 trajectories"),

@@ -208,7 +208,7 @@ def test_a_fleet_learns_what_its_learners_learn():
     for i, key in enumerate(jax.random.split(KEY, 2)):
         alone = learner.update(learner.init(key), seen[i])[1]
         np.testing.assert_allclose(reports.agreement[i], alone.agreement, atol=1e-8)
-    # A fleet cannot raise; an impossible observation leaves its learner unchanged.
+    # A fleet raises nothing; what cannot be leaves its learner as it was.
     left, reports = many.update(states, both._replace(state=both.state + np.array([99, 0])[:, None, None]))
     np.testing.assert_array_equal(np.isneginf(reports.demonstration_log_likelihood), [True, False])
     for field in ("weights", "logits", "session"):
