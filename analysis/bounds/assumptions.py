@@ -2,7 +2,7 @@
 
 The theorems ask for weights and features in [0, 1], a soft expert, whole independent trajectories, and an
 M-step that met its threshold. A :class:`Bound` carries these premises with it; :func:`check` decides those
-that an MDP, weights and a run can decide; the rest its user has to answer for (:meth:`Bound.assuming`).
+that an MDP, weights and a run settle; the user is responsible for the rest (:meth:`Bound.assuming`).
 """
 
 from __future__ import annotations

@@ -79,7 +79,7 @@ def complete_under(
     codes: Int[Array, "replications size L 3"],
     draws: int,
 ) -> Completed:
-    """:func:`~i2rl.analysis.bounds.coverage.complete_features` of each run under its own reliabilities."""
+    """Complete the features of each replication under its own reliabilities (:func:`.complete_features`)."""
 
     def one(inputs: tuple) -> Completed:
         key, p, codes = inputs

@@ -361,7 +361,7 @@ def _kept(name: str, method: str, seed: int, plan: Plan, folder: Path | None) ->
         return Outcome(**fields)
     outcome = run(name, method, seed, plan)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # In one step: a run that is interrupted must not leave half a file, which would be found again.
+    # In one step: an interrupted replication must not leave half a file, which a later run would load.
     part = path.with_suffix(".part")
     part.write_text(json.dumps(plain(outcome._asdict())))
     part.replace(path)

@@ -166,7 +166,7 @@ def sorted_belts(
     """Tally the expert's and the learned policies on simulated belts, beside the table of Figure 7.9.
 
     The replications of a method share about ``belts`` belts, equally many each and at least one. Its tally
-    has one entry a run, the sum over that run's belts: belts sorted with one policy are not independent. A
+    has one entry a replication, the sum over its belts: belts sorted with one policy are not independent. A
     method whose name begins with that of a published row has it beside it.
     """
     sorting, line = pick_inspect_place(), Line()

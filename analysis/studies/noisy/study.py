@@ -90,7 +90,7 @@ class MeanInterval(NamedTuple):
 
 
 def mean_interval(replications: Float[np.ndarray, "replications ..."]) -> MeanInterval:
-    """Mean over the first axis, with the normal distribution's interval; NaN at its ends for one run."""
+    """Compute the mean over the first axis with a normal interval; its ends are NaN for one replication."""
     replications = np.asarray(replications, float)
     mean, n = replications.mean(0), len(replications)
     half = 1.96 * replications.std(0, ddof=1) / np.sqrt(n) if n > 1 else np.full_like(mean, np.nan)

@@ -79,7 +79,8 @@ def feature_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.nd
 
 
 def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
-    """Trajectories of the first run on two principal components of feature counts, a panel a method.
+    """Draw the first replication's trajectories on two principal components of feature counts, a panel a
+    method.
 
     The marker is the true component; the colour the component found.
     """
@@ -144,7 +145,7 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
         )
         for d in range(min(most, _COLOURS))
     ]
-    head(figure, theme, handles, title=f"{counted(len(study.labels), 'trajectory')}, first run")
+    head(figure, theme, handles, title=f"{counted(len(study.labels), 'trajectory')}, first replication")
     told = ";\n".join(f"component {k + 1}: {_loading(mdp, embedding.loadings[k])}" for k in range(2))
     foot(figure, theme, told)
     return figure
@@ -359,7 +360,7 @@ def _border(centre: tuple[float, float], towards: tuple[float, float]) -> tuple[
 
 
 def evd_plot(study: SortingStudy, theme: Theme) -> Figure:
-    """EVD against trajectories: every run a dot, the mean a line, a bar over all replications.
+    """Draw EVD against trajectories: every replication a dot, the mean a line, a bar over all replications.
 
     The scale is logarithmic down to a power of ten below the smallest value that is not zero, and linear
     from there to zero.
