@@ -1,4 +1,4 @@
-# Everything happens in .venv, made from the exact versions in requirements.lock.
+# All targets use .venv, made from the exact versions in requirements.lock.
 PYTHON ?= python3
 VENV := .venv
 BIN := $(VENV)/bin
@@ -33,11 +33,11 @@ docs: $(READY)
 	$(BIN)/mkdocs build
 	@echo "Open build/docs/index.html."
 
-# Executes the notebooks in place, at full size.
+# Execute the notebooks in place, at full size.
 notebooks: $(READY)
 	$(BIN)/python -m i2rl.analysis.notebooks.execute
 
-# Trains the experts of the continuous tasks anew, and records them in domains/recordings.
+# Train the experts of the continuous tasks, and record them in domains/robots/recordings.
 experts: $(READY)
 	$(BIN)/python -m i2rl.domains.robots.experts
 

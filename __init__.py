@@ -1,6 +1,6 @@
 """Online inverse reinforcement learning from imperfect observations.
 
-The parts are imported when they are used, so that ``import i2rl`` costs nothing:
+Parts are imported at their first use, so that ``import i2rl`` is immediate:
 :mod:`i2rl.models`, :mod:`i2rl.inference`, :mod:`i2rl.domains`, :mod:`i2rl.analysis`.
 
 Unless ``OPENBLAS_NUM_THREADS`` is set, or SciPy is loaded already (JAX loads it), importing this package asks

@@ -1,3 +1,3 @@
-"""The package's version, kept apart so that the build reads it without importing anything."""
+"""Version of the package, in a module of its own so that the build reads it without other imports."""
 
 __version__ = "0.1.0"

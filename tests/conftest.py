@@ -159,7 +159,7 @@ def _perceive(keys, mdp, log_policy, sensor, length):
 def _imperfect_demonstration(
     seed: int, mdp: TabularMDP, log_policy: np.ndarray, sensor: object, n: int, length: int
 ) -> Demonstration:
-    """Ragged trajectories seen through a sensor, some frames lost and some coordinates not reported."""
+    """Simulate ragged trajectories through a sensor, with lost frames and unobserved coordinates."""
     rng = np.random.default_rng(seed)
     keys = jax.random.split(jax.random.key(seed), n)
     codes = np.array(_perceive(keys, mdp, log_policy, sensor, length))

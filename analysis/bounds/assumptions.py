@@ -2,7 +2,7 @@
 
 The theorems ask for weights and features in [0, 1], a soft expert, whole independent trajectories, and an
 M-step that met its threshold. A :class:`Bound` carries these premises with it; :func:`check` decides those
-that an MDP, weights and a run can decide; the rest its user has to answer for (:meth:`Bound.assuming`).
+that an MDP, weights and a run settle; the user is responsible for the rest (:meth:`Bound.assuming`).
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ class Bound(NamedTuple):
     Fields
     ------
     source, statement : str
-        The theorem's numbers, and what is bounded.
+        The theorem's numbers, and the bounded quantity.
     error : float
         The bound: nats per trajectory, or units of ``(1 - gamma) E[phi]`` for a lemma on constraints.
     confidence : float
@@ -104,9 +104,9 @@ class Bound(NamedTuple):
         """
         if self.violated:
             reasons = "; ".join(f"{a.statement} ({a.reason or 'stated not to hold'})" for a in self.violated)
-            raise BoundNotGuaranteed(f"{self.source} guarantees nothing here. It needs: {reasons}")
+            raise BoundNotGuaranteed(f"{self.source} gives no guarantee here. It needs: {reasons}")
         if self.confidence <= 0:
-            raise BoundNotGuaranteed(f"{self.source} guarantees nothing here: its confidence is 0")
+            raise BoundNotGuaranteed(f"{self.source} gives no guarantee here: its confidence is 0")
         sentence = f"{self.statement} = {self.error:.4g} with probability at least {self.confidence:.4g}"
         if self.undecided:
             sentence += ", provided that " + "; ".join(a.statement for a in self.undecided)
@@ -117,7 +117,7 @@ FEATURES = Assumption("features", "features lie in [0, 1]")
 WEIGHTS = Assumption("weights", "the expert's weights lie in [0, 1]^K")
 SOFT_EXPERT = Assumption("soft_expert", "the expert acts by the soft policy of its weights")
 INDEPENDENT = Assumption("independent", "trajectories are independent and equally distributed")
-WHOLE = Assumption("whole", "trajectories are so long that discounting leaves nothing beyond their end")
+WHOLE = Assumption("whole", "trajectories are so long that their discounted rest is negligible")
 PROGRAM = Assumption("program", "the features statistic is kept, with slack epsilon")
 DIMINISHING = Assumption(
     "program", "the features statistic is kept, with slack c / i in session i (Harmonic)"
@@ -135,13 +135,13 @@ OBSERVATION = Assumption(
 PREDICATES_SEEN = Assumption("predicates_seen", "every predicate is observed in the first session")
 INDEPENDENT_PREDICATES = Assumption(
     "independent_predicates",
-    "every predicate is reported rightly or wrongly by itself, with one probability at every pair and step",
+    "every predicate is observed independently, with one probability at every pair and step",
 )
 KNOWN_TRUTHS = Assumption(
-    "known_truths", "reliabilities were counted on n_o independent reports whose truth was known"
+    "known_truths", "reliabilities were counted on n_o independent observations of known truth"
 )
 OTHER_REPORTS = Assumption(
-    "other_reports", "reliabilities were counted on other reports than those of the trajectories"
+    "other_reports", "reliabilities were counted on other observations than those of the trajectories"
 )
 EXPERTS_POSTERIOR = Assumption(
     "experts_posterior", "hidden pairs are filled in under weights as good as the expert's"
@@ -201,7 +201,7 @@ def check(
         found["weights"] = inside, f"they range from {weights.min():.4g} to {weights.max():.4g}"
     if expert is not None:
         if mdp is None or weights is None:
-            raise ValueError("whether an expert is soft is decided from its policy, weights and the MDP")
+            raise ValueError("`expert` also needs `weights` and the MDP, to test whether it is soft")
         found["soft_expert"] = _soft(mdp, weights, np.asarray(expert, float))
     if length is not None:
         if mdp is None:

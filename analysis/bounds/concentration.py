@@ -76,8 +76,8 @@ def confidence_sequence(values: Float[np.ndarray, "... n K"], delta: float) -> I
     """Intervals after each value that hold at all times together (Waudby-Smith and Ramdas 2023, Theorem 2).
 
     Arrays are ``[..., n, K]``: entry ``t`` uses the first ``t + 1`` values. With probability ``1 - delta``
-    none of them misses, however long the sequence and whatever stops it, so that later intervals may be
-    intersected with earlier ones.
+    none of them misses, for every length of the sequence and every stopping rule, so that later intervals may
+    be intersected with earlier ones.
     """
     values = _in_unit_interval(values)
     bets, squares = _bets(values, lambda t: t * np.log(1 + t), delta)

@@ -46,7 +46,7 @@ _BATCH = 32
 
 
 class Setting(NamedTuple):
-    """An expert to simulate: process, true weights ``[K]``, what is hidden, and steps of a trajectory."""
+    """An expert to simulate: process, true weights ``[K]``, sensor, and steps of a trajectory."""
 
     name: str
     mdp: TabularMDP
@@ -67,8 +67,8 @@ class Coverage(NamedTuple):
     confidence, covered : float
         The stated one, and the share of replications within the bound.
     bound, quantile : float
-        The bound (median over replications where it depends on the data), and the quantile of what was seen
-        at the stated confidence: the smallest number that would have been right as often.
+        The bound (median over replications where it depends on the data), and the observed quantile at the
+        stated confidence: the smallest number that would have been right as often.
     replications : int
     """
 
@@ -137,7 +137,7 @@ def simulate_codes(
 class Completed(NamedTuple):
     """Features of each trajectory with its hidden steps filled in under the expert's own weights.
 
-    ``exact`` is their expectation given what was seen, ``sampled`` their mean over some completions.
+    ``exact`` is their expectation given the observations, ``sampled`` their mean over some completions.
     """
 
     exact: Float[Array, "replications size K"]
@@ -403,7 +403,7 @@ def coverage_of(
     bounds: Float[np.ndarray, " replications"],
     seen: Float[ArrayLike, " replications"],
 ) -> Coverage:
-    """Compare what was ``seen`` in each run with its bound."""
+    """Compare the ``seen`` value of each replication with its bound."""
     seen = np.asarray(seen)
     return Coverage(
         setting.name,

@@ -55,7 +55,7 @@ def posterior_distance(perception: Perception, reliabilities: Float[np.ndarray, 
 
     Total variation, at most ``tanh(L / 4 sum_j |logit p_j - logit p_hat_j|)``, for all observations, weights
     and estimates: likelihood ratios of two trajectories change by at most the exponential of ``L`` times that
-    sum. One if a reliability may be 0 or 1. Errors as :func:`report_distance`.
+    sum. One if a reliability may be 0 or 1. Errors as :func:`observation_distance`.
     """
     p, ends = _intervals(perception, reliabilities)
     if not ((ends > 0) & (ends < 1)).all():
@@ -71,7 +71,7 @@ class ModelDistance(NamedTuple):
     ------
     variation : float
         Total variation between the observations of a truth, at the worst truth. ``1 - (1 - variation)^L``
-        takes the place of :func:`report_distance`.
+        takes the place of :func:`observation_distance`.
     odds : float
         Largest change of the logarithm of a likelihood ratio of two truths, at the worst observation.
         ``tanh(L odds / 4)`` takes the place of :func:`posterior_distance`.
@@ -94,7 +94,7 @@ def model_distance(
     Raises ``ValueError`` for sensors without an observation model, or about different pairs.
     """
     if one.noise is None or other.noise is None:
-        raise ValueError("an imperfection without an observation model reports exactly: nothing to compare")
+        raise ValueError("both sensors must have observation models; a sensor without one observes exactly")
     tables = [np.asarray(x.noise.log_probabilities) for x in (one, other)]  # type: ignore[union-attr]
     if tables[0].shape != tables[1].shape:
         raise ValueError(f"the models are about pairs {tables[0].shape[:2]} and {tables[1].shape[:2]}")

@@ -1,4 +1,4 @@
-"""Pictures of the bounds: how much data an error costs, and how far a bound is from what happens."""
+"""Pictures of the bounds: data against error, and the looseness of a bound."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def sample_size_plot(
     if ignorance is not None:
         axes.axvline(ignorance, color=theme.muted, linewidth=1.2, linestyle=(0, (1, 1.5)))
         axes.annotate(
-            "right of this line,\nknowing nothing\nis as good",
+            "right of this line,\nzero weights\nare as good",
             (ignorance, 0),
             (6, 6),
             xycoords=("data", "axes fraction"),
@@ -99,7 +99,7 @@ def looseness_plot(rows: Sequence[Coverage], *, theme: Theme = LIGHT, title: str
     Bounds of one picture should share their unit (nats per trajectory).
     """
     if not rows:
-        raise ValueError("there is nothing to draw: give at least one row of a coverage study")
+        raise ValueError("`rows` must hold at least one row of a coverage study; got none")
     figure = new_figure(theme, 8.4, 1.7 + 0.42 * len(rows))
     axes = figure.subplots()
     heights = np.arange(len(rows))[::-1]

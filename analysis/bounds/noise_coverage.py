@@ -60,8 +60,9 @@ def counted_reliabilities(
     if len(classes.vectors) != 2 ** len(noise.predicates) or np.ptp(classes.reportable) > 0:
         raise ValueError(
             f"of {2 ** len(noise.predicates)} combinations of the predicates' values "
-            f"{np.count_nonzero(classes.reportable)} can be reported, by {classes.reportable.min():g} to "
-            f"{classes.reportable.max():g} pairs: predicates are not independent, and reliabilities no shares"
+            f"{np.count_nonzero(classes.reportable)} can be observed, by {classes.reportable.min():g} to "
+            f"{classes.reportable.max():g} pairs: predicates must be independent for reliabilities to "
+            f"be shares"
         )
     p = noise.reliabilities
     right = jax.random.binomial(key, observations, p, (replications, len(p)))
@@ -78,7 +79,7 @@ def complete_under(
     codes: Int[Array, "replications size L 3"],
     draws: int,
 ) -> Completed:
-    """:func:`~i2rl.analysis.bounds.coverage.complete_features` of each run under its own reliabilities."""
+    """Complete the features of each replication under its own reliabilities (:func:`.complete_features`)."""
 
     def one(inputs: tuple) -> Completed:
         key, p, codes = inputs
@@ -173,8 +174,8 @@ def learned_perception_coverage(
     """Theorem 6 with hidden pairs filled in under the learner's own weights, exactly.
 
     The learner believes in reliabilities that are all off by ``shift`` times ``epsilon_o``; -1 and 1 are
-    corners of what the theorem allows. It completes as LME-I2RL does: the premise about completions is not
-    known to hold. Raises ``ValueError`` for a ``shift`` outside [-1, 1].
+    corners of the theorem's range. It completes as LME-I2RL does: the premise about completions is not known
+    to hold. Raises ``ValueError`` for a ``shift`` outside [-1, 1].
     """
     if not -1 <= shift <= 1:
         raise ValueError(f"the theorem allows reliabilities off by epsilon_o, got {shift} times that")

@@ -91,8 +91,7 @@ def rimeo_constraint_bound(
 
     ``(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon_r = epsilon + epsilon_s + L |Psi| epsilon_o`` with
     probability at least ``max(0, 1 - delta - delta_s - delta_o)``, ``delta_o = 2 K |Psi| exp(-2 n_o
-    epsilon_o^2)``. The module says what is wrong with it; :func:`noisy_constraint_bound` is what can be
-    proved.
+    epsilon_o^2)``. The module states its faults; :func:`noisy_constraint_bound` is what can be proved.
     """
     lemma = lme_constraint_bound(size, draws, epsilon, epsilon_s, n_features)
     counted("predicates", perception.predicates), counted("longest", perception.longest)
@@ -124,7 +123,7 @@ def noisy_constraint_bound(
     """Bound by Lemma 4 corrected: ``(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + d`` for all ``k``.
 
     With probability at least ``max(0, 1 - delta - delta_o)``, ``delta_o = 2 |Psi| exp(-2 n_o epsilon_o^2)``,
-    and ``d`` the :func:`.report_distance`, smaller if the estimated ``reliabilities [J]`` are given.
+    and ``d`` the :func:`.observation_distance`, smaller if the estimated ``reliabilities [J]`` are given.
     ``phi_hat`` is the posterior's, exact or of independent draws from it, under the expert's weights and
     reliabilities counted on ``n_o`` other observations of known truth.
     """

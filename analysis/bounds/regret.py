@@ -186,7 +186,7 @@ def log_log_slope(regret: Float[np.ndarray, " T"], burn_in: int = 10) -> Slope:
 
 
 def sure_bound(beta: Float[np.ndarray, " T"], expert_weights: Float[np.ndarray, " K"]) -> np.ndarray:
-    """``1/T sum_{i <= T} beta_i |theta_E|_1 [T]``: what the empirical average regret cannot exceed.
+    """``1/T sum_{i <= T} beta_i |theta_E|_1 [T]``: the bound of the empirical average regret.
 
     For programs solved to their optimum on a statistic that is the data's (module docstring).
     """

@@ -51,7 +51,7 @@ def answer(
     features are those of an expert who softly obeys the patrol's true weights, and assumptions are checked
     against it. ``predicates`` and ``steps`` (both or none) are the ``|Psi|`` and ``L`` of noisy perception.
     Raises ``ValueError`` for numbers out of range, for neither ``features`` nor ``mdp``, for both ``mdp`` and
-    something that it decides, and for ``predicates`` without ``steps`` or the other way round.
+    a value that it determines, and for ``predicates`` without ``steps`` or the reverse.
     """
     if (predicates is None) != (steps is None):
         raise ValueError("noisy perception is described by --predicates and --steps: give both or neither")
@@ -163,8 +163,8 @@ def print_answer(answer: Answer, console: Console) -> None:
     if answer.informative is not None and answer.ignorance_nats < error:
         needed = answer.informative["trajectories"]
         console.print(
-            f"Knowing nothing (zero weights) is {answer.ignorance_nats:.4g} nats from this expert: an error "
-            "above that promises nothing.\nTo promise as much takes "
+            f"Zero weights are {answer.ignorance_nats:.4g} nats from this expert: a bound above that is "
+            "vacuous.\nAn informative bound takes "
             f"{needed['theorem']} trajectories by the theorem, {needed['exact completion']} with exact "
             f"completion, {needed['observed spread']} with the observed spread."
         )
@@ -188,7 +188,7 @@ def _print_perception(needed: pd.DataFrame, console: Console) -> None:
     table = Table(title="The same error under noisy perception")
     names = {"printed": "Theorem 6 of appendix E", "corrected": "corrected"}
     table.add_column("bound")
-    for name in ("trajectories", "draws of the hidden pairs", "reports of known truth", "their error"):
+    for name in ("trajectories", "draws of the hidden pairs", "observations of known truth", "their error"):
         table.add_column(name, justify="right")
     for row in needed.itertuples():
         draws = str(row.draws) if row.draws else "none"

@@ -98,7 +98,7 @@ class Verdict(NamedTuple):
         Sessions each stream ran for: all where the rule never fired.
     sessions : int
     loss : float
-        Mean accuracy given away by stopping, against what the streams settle at; can be negative.
+        Mean accuracy lost by stopping, against the streams' final accuracy; can be negative.
     """
 
     false_stops: int

@@ -130,7 +130,7 @@ def lme_constraint_bound(
     ``(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + epsilon_s`` for all ``k`` with probability at least
     ``max(0, 1 - delta - delta_s)``, ``delta_s = 2 K exp(-2 n_s epsilon_s^2)``. That completed features obey
     Hoeffding's inequality with ``n_s`` draws is assumed, not proved: draws under other weights than the
-    expert's are biased, and even the exact expectation given what was seen is not the realised mean. With
+    expert's are biased, and even the exact expectation given the observations is not the realised mean. With
     the exact completion under the expert's weights the completed mean is itself an average of independent
     values in [0, 1], so that ``epsilon`` and ``delta`` alone suffice.
     """
@@ -184,11 +184,11 @@ def no_regret(
     """Theorem 3 (chapter 4), Theorem 5 (appendix B): average regret with ``epsilon_i / (1 - gamma) = c / i``.
 
     ``Regret_T <= 2 K c H_T / T`` with probability at least ``prod_i max(0, 1 - delta_i)``, ``delta_i = 2 K
-    exp(-2 |X_{1:i}| epsilon_i^2)``. Three corrections: ``H_T = sum 1 / i`` exceeds the ``log T`` of the
-    proof (by 0.577 in the limit); the product is that of independent events, which sessions that share their
-    data are not, so that ``bound`` is quoted with ``1 - sum_i delta_i``; and with sessions of one size ``m``,
+    exp(-2 |X_{1:i}| epsilon_i^2)``. Three corrections: ``H_T = sum 1 / i`` exceeds the ``log T`` of the proof
+    (by 0.577 in the limit); the product is that of independent events, which sessions that share their data
+    are not, so that ``bound`` is quoted with ``1 - sum_i delta_i``; and with sessions of one size ``m``,
     ``|X_{1:i}| epsilon_i^2 = m c^2 (1 - gamma)^2 / i`` goes to zero, so ``delta_i`` goes to ``2 K`` and the
-    confidence is 0 from some session on, whatever ``c``. Sessions have to grow, see :func:`no_regret_sizes`.
+    confidence is 0 from some session on, for every ``c``. Sessions have to grow, see :func:`no_regret_sizes`.
     What survives is :func:`sure_gap`: the regret on the learner's own data is at most half of this bound
     surely.
 
@@ -272,8 +272,8 @@ def monotonicity(
 class ObservedBound(NamedTuple):
     """A bound computed from the features that were observed.
 
-    ``target [K]`` and ``slack [K]`` are what the maximum-entropy program has to be given for ``bound`` to
-    hold of its solution. Both are in units of ``phi_hat``: the program takes ``slack`` divided by
+    ``target [K]`` and ``slack [K]`` are the maximum-entropy program's inputs with which ``bound`` holds for
+    its solution. Both are in units of ``phi_hat``: the program takes ``slack`` divided by
     :func:`~i2rl.models.process.units.feature_scale`.
     """
 
@@ -338,9 +338,9 @@ def observed_size(deviations: Float[np.ndarray, " K"], error: float, confidence:
     """Trajectories with which :func:`observed_bound` is about ``2 K error / (1 - gamma)`` nats.
 
     ``deviations [K]`` are the standard deviations of the features' discounted averages ``(1 - gamma) f_k``
-    (:func:`~i2rl.models.process.planning.feature_deviations` times ``1 - gamma``, or a guess). A plan: what
-    is guaranteed is the bound computed once the trajectories are there. Raises ``ValueError`` for a
-    confidence outside (0, 1), an error that is not positive, or deviations outside [0, 1/2].
+    (:func:`~i2rl.models.process.planning.feature_deviations` times ``1 - gamma``, or a guess). A plan: the
+    guarantee is the bound computed from the actual trajectories. Raises ``ValueError`` for a confidence
+    outside (0, 1), an error that is not positive, or deviations outside [0, 1/2].
     """
     spread = np.atleast_1d(np.asarray(deviations, float))
     if spread.ndim != 1 or not ((spread >= 0) & (spread <= 0.5)).all():
@@ -405,8 +405,8 @@ def table_7_1a(n_features: int = 6, delta: float = 0.1, discount: float = 0.99) 
     """Table 7.1(a): trajectories for an error, with confidence ``1 - (delta + delta_s)``, both ``delta``.
 
     Indexed by ``epsilon_l``. ``trajectories`` is the nearest integer, as printed, ``sufficient`` the smallest
-    number that keeps the promise. ``draws`` and ``error_nats`` are what the caption leaves out: the samples
-    that ``epsilon_s`` needs, and the log-likelihood error that is bought, ``4 K epsilon_l / (1 - gamma)``.
+    number that keeps the promise. ``draws`` and ``error_nats`` are absent from the caption: the samples that
+    ``epsilon_s`` needs, and the log-likelihood error that is bought, ``4 K epsilon_l / (1 - gamma)``.
     """
     rows = []
     for epsilon, epsilon_s in ((0.2, 0.05), (0.1, 0.05), (0.05, 0.05), (0.04, 0.05)):

@@ -178,7 +178,13 @@ def run_sorting(
         count_option("Sessions of the online learner; they end at the numbers above unless given."),
     ] = None,
     n_components: Annotated[
-        int, count_option("Components that MME-MTIRL starts with: the most it can find.")
+        int,
+        typer.Option(
+            "--components",
+            min=1,
+            max=10**7,
+            help="Components that MME-MTIRL starts with: the most it can find.",
+        ),
     ] = 4,
     steps: Annotated[int, count_option("Steps of a trajectory.")] = 50,
     replications: Annotated[int, count_option("Independent repetitions.")] = 3,
@@ -189,9 +195,7 @@ def run_sorting(
     ),
     as_json: Json = False,
 ) -> None:
-    """Learn the rewards of several ways to sort onions, their number and their trajectories, from mixed
-    demonstrations.
-    """
+    """Learn the components of onion sorting from mixed demonstrations: number, rewards and trajectories."""
     from ..studies.sorting import page as sorting_page
     from ..studies.sorting import study as sorting_study
 

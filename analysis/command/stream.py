@@ -215,7 +215,7 @@ def learn_stream(
     """Run a session per ``size`` trajectories of JSON Lines, committing each before the next begins.
 
     Lines of other agents are passed over; the last session may be shorter. Resumes where the journal left
-    off, to the bit: what was consumed is skipped after checking that it is the same input.
+    off, to the bit: the consumed part is skipped after checking that it is the same input.
 
     With ``quarantine`` bad lines are set aside there: those that are no trajectory, are beyond ``limits``, or
     hold an observation that the model rules out. A session is then made of the next good lines. If it is not

@@ -1,8 +1,8 @@
 """The page that a study writes: one file of text, tables and pictures, readable offline and in either theme.
 
-Every page has the same first screen: a sentence on what was learned, one on whether to trust it, the weights
-with intervals. :func:`write_page` asks for it, spells acronyms out where they first stand, and writes every
-number given as a number with :func:`~i2rl.analysis.drawing.text.number`.
+Every page has the same first screen: a sentence on the result, one on its reliability, the weights with
+intervals. :func:`write_page` asks for it, spells acronyms out where they first stand, and writes every number
+given as a number with :func:`~i2rl.analysis.drawing.text.number`.
 """
 
 from __future__ import annotations
@@ -98,7 +98,7 @@ class Lead(NamedTuple):
     Fields
     ------
     learned : str
-        A sentence on what was learned.
+        A sentence on the result.
     trust : str
         A sentence on whether to trust it, and why.
     weights : sequence of Table

@@ -3,8 +3,8 @@
 Every two of the eight colours of a theme are at least 0.1 apart in OKLab, also as seen without red, green or
 blue cones (Machado, Oliveira and Fernandes 2009); markers and dashes say the same once more.
 
-Figures are made without pyplot and without touching ``rcParams``: they are values, drawn in either theme,
-and a caller's own style stays what it was.
+Figures are made without pyplot and without touching ``rcParams``: they are values, drawn in either theme, and
+a caller's own style stays unchanged.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ NOTHING = "-"
 
 
 def printable(text: object, *, lines: bool = False) -> str:
-    r"""Show control characters as Python writes them, so that nothing obeys them.
+    r"""Show control characters as Python writes them, so that terminals ignore them.
 
     ``lines`` leaves line ends alone.
 

@@ -1,7 +1,7 @@
 """Quality of a learned reward (section 7.2), and uncertainty of the numbers.
 
-A learned reward is judged by the behaviour it prescribes, under the expert's true reward: whether it acts
-like the expert, and what it loses. Everything is exact: no simulation, no offset, no rescaling.
+A learned reward is judged by the behaviour it prescribes, under the expert's true reward: agreement with the
+expert, and loss of value. Everything is exact: no simulation, no offset, no rescaling.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def optimal_actions(mdp: TabularMDP, weights: Float[Array, " K"]) -> Bool[Array,
 def policy_accuracy(mdp: TabularMDP, optimal: Bool[Array, "S A"], policy: Float[Array, "S A"]) -> Accuracy:
     """Probability that ``policy`` takes one of the ``optimal`` actions, averaged over states.
 
-    For a deterministic policy this is LBA; pass a policy here to break its ties another way. Every optimal
+    For a deterministic policy this is LBA; pass a policy here to break its ties differently. Every optimal
     action counts as a match.
     """
     hit = jnp.sum(jnp.where(optimal, policy, 0.0), axis=1)
@@ -253,7 +253,7 @@ def quantile_band(replications: Float[np.ndarray, "replications ..."], coverage:
     replications = np.asarray(replications, float)
     if replications.ndim < 1 or replications.shape[0] == 0:
         raise ValueError(
-            f"a band needs at least one run along the first axis, got shape {replications.shape}"
+            f"a band needs at least one replication along the first axis; got shape {replications.shape}"
         )
     if not 0 < coverage < 1:
         raise ValueError(f"coverage must lie in (0, 1), got {coverage}")

@@ -1,7 +1,7 @@
 """Recovery of several behaviours from mixed demonstrations, and the value of each component (section 7.2).
 
-Ways found and behaviours demonstrated are numbered independently: agreement of the two is judged up to a
-renumbering, values under the true reward of what each trajectory really was.
+Components found and behaviours demonstrated are numbered independently: agreement of the two is judged up to
+a renumbering, values under the true reward of what each trajectory really was.
 """
 
 from __future__ import annotations
@@ -36,10 +36,10 @@ def expected_value_difference(
 ) -> float:
     """EVD: value lost by acting as was learned, summed over the states of a trajectory, mean of trajectories.
 
-    ``1/N sum_i sum_{s in y_i} |V^{pi(theta*_{b_i})}(s) - V^{pi(theta_{c_i})}(s)|`` with ``b_i`` the
-    behaviour a trajectory was done in and ``c_i`` the way it was assigned to (section 7.2). Both policies
-    are greedy, ties as in :func:`~i2rl.analysis.judging.metrics.greedy_policy`, and both values exact and
-    under the trajectory's own true reward, in units of discounted reward. Equal policies lose exactly zero.
+    ``1/N sum_i sum_{s in y_i} |V^{pi(theta*_{b_i})}(s) - V^{pi(theta_{c_i})}(s)|`` with ``b_i`` a
+    trajectory's behaviour and ``c_i`` its assigned component (section 7.2). Both policies are greedy, ties as
+    in :func:`~i2rl.analysis.judging.metrics.greedy_policy`, and both values exact and under the trajectory's
+    own true reward, in units of discounted reward. Equal policies lose exactly zero.
 
     Parameters
     ----------
@@ -49,9 +49,9 @@ def expected_value_difference(
     labels : int ``[n]``
         Behaviour of each trajectory.
     learned : float ``[D, K]``
-        Weights of each way found.
+        Weights of each component found.
     assignments : int ``[n]``
-        Way of each trajectory.
+        Component of each trajectory.
     demonstration : Demonstration
         The trajectories as they really were, every state known. Rows of padding are no trajectories.
 
@@ -98,7 +98,7 @@ def _losses(
 
 
 def assignment_accuracy(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> float:
-    """Share of trajectories in the way that is their behaviour's, under the best one-to-one matching.
+    """Compute the share of trajectories in their behaviour's component, under the best one-to-one matching.
 
     Raises ``ValueError`` for no trajectory or another number of labels than of assignments.
     """
@@ -109,7 +109,7 @@ def assignment_accuracy(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarr
 def match_components(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> dict[int, int]:
     """Match behaviours to components, one to one, with the most trajectories in common.
 
-    A behaviour is missing where no way is left for it that has any of its trajectories. Errors as for
+    A behaviour is missing if no remaining component has any of its trajectories. Errors as for
     :func:`assignment_accuracy`.
     """
     table, behaviours, components = _contingency(labels, assignments)
@@ -138,7 +138,7 @@ def adjusted_rand_index(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarr
 
 
 def _contingency(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray, " n"]) -> tuple:
-    """Trajectories of each behaviour in each way, and the names of rows and columns."""
+    """Count the trajectories of each behaviour in each component; name rows and columns."""
     labels, assignments = np.asarray(labels), np.asarray(assignments)
     if labels.ndim != 1 or labels.shape != assignments.shape or not labels.size:
         raise ValueError(
@@ -161,7 +161,7 @@ def _weights(mdp: TabularMDP, which: str, weights: Float[np.ndarray, "D K"]) -> 
     if not np.isfinite(weights).all():
         component, k = np.argwhere(~np.isfinite(weights))[0]
         raise ValueError(
-            f"the {which} weight of feature {shortened(mdp.feature_names[k])} in way {component} is "
+            f"the {which} weight of feature {shortened(mdp.feature_names[k])} in component {component} is "
             f"{weights[component, k]}, not a number"
         )
     return weights

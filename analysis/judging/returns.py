@@ -389,11 +389,12 @@ def recovered_share(
     n = len(replications[0])
     if n == 0 or any(x.shape != (n,) for x in replications):
         raise ValueError(
-            f"clean, noisy and robust need one number a seed, got shapes {[x.shape for x in replications]}"
+            f"clean, noisy and robust need one number a replication; got shapes "
+            f"{[x.shape for x in replications]}"
         )
     for name, values in zip(("clean", "noisy", "robust"), replications, strict=True):
         if not np.isfinite(values).all():
-            raise ValueError(f"seed {int(np.argmin(np.isfinite(values)))} of {name} is not finite")
+            raise ValueError(f"replication {int(np.argmin(np.isfinite(values)))} of {name} is not finite")
 
     def ratio(lost: np.ndarray, gained: np.ndarray) -> np.ndarray:
         with np.errstate(divide="ignore", invalid="ignore"):

@@ -1,4 +1,4 @@
-"""Checks of posteriors over weights: what they are about, whether they converged, how they narrow.
+"""Checks of posteriors over weights: their variables, convergence and concentration.
 
 Posteriors are those of :func:`~i2rl.inference.posteriors.weights.sample_posterior`: ``weights`` with the
 dimensions ``chain``, ``draw`` and ``feature``; from :func:`posterior_by_session` also with a ``session``.
@@ -39,7 +39,9 @@ from .history import provenance
 
 
 class InferenceDataError(ValueError):
-    """An ``InferenceData`` that is not what a diagnostic needs; says what was given and what was expected."""
+    """Error of an ``InferenceData`` that does not fit a diagnostic; states the given and the expected
+    content.
+    """
 
 
 def require_posterior(
@@ -121,9 +123,9 @@ def summary(idata: az.InferenceData, **options: Any) -> pd.DataFrame:
 
     A row for each weight (``weights[near]``, or ``weights[20, near]`` by session) with ``mean``, ``sd``, the
     highest-density interval, ``mcse_mean``, ``mcse_sd``, ``ess_bulk``, ``ess_tail``, ``r_hat`` (NaN for a
-    single chain), and ``divergences``: of the chains that the weight was drawn by, NaN where the sampler
-    left no statistics. ``options`` as for ``az.summary`` (``hdi_prob``, say). Raises
-    :class:`InferenceDataError` for what is no posterior.
+    single chain), and ``divergences``: of the chains that the weight was drawn by, NaN where the sampler left
+    no statistics. ``options`` as for ``az.summary`` (``hdi_prob``, say). Raises :class:`InferenceDataError`
+    for data that are no posterior.
     """
     weights = require_posterior(idata, extra=_by_session(idata))
     # Unrounded, ArviZ's columns are of type object.

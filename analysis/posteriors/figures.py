@@ -1,4 +1,4 @@
-"""Figures of posteriors over weights: how they narrow, whether the chains agree, what they predict.
+"""Figures of posteriors over weights: their concentration, the agreement of chains, their predictions.
 
 ArviZ computes, the project's themes draw. Each function takes a posterior of
 :func:`~i2rl.inference.posteriors.weights.sample_posterior` (weights with the dimensions ``chain``, ``draw``

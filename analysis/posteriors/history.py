@@ -1,7 +1,7 @@
 """Histories of learners as ArviZ ``InferenceData``.
 
 A learner's weights are point estimates, one a session, and no draws from anything, so they go into a group
-``sessions`` of their own (as in a journal's export), and what the learner ended with into a group
+``sessions`` of their own (as in a journal's export), and the learner's last estimates into a group
 ``learned``.
 """
 
@@ -100,7 +100,7 @@ def run_history(
     """
     infos, statistic = _infos(run), _statistic_of(run) if statistic is None else statistic
     if np.ndim(infos[0].session) > 0:
-        raise ValueError("these are reports of a fleet, an array for each field: use fleet_history")
+        raise ValueError("these are infos of a fleet, an array for each field: use fleet_history")
     return _history(learner, infos, (), statistic, seed, true_weights)
 
 
@@ -120,7 +120,7 @@ def fleet_history(
     """
     infos = _infos(infos)
     if np.ndim(infos[0].session) != 1:
-        raise ValueError("these are reports of a single learner: use run_history")
+        raise ValueError("these are infos of a single learner: use run_history")
     return _history(learner, infos, ("run",), getattr(state, "statistic", None), seed, true_weights)
 
 
@@ -128,10 +128,10 @@ def _infos(run: Run | Sequence[SessionInfo]) -> Sequence[SessionInfo]:
     # An info is itself a tuple of numbers.
     infos = run.infos if isinstance(run, Run) else run
     if not len(infos):
-        raise ValueError("a history needs at least one session, got no reports")
+        raise ValueError("a history needs at least one session; got no infos")
     if not all(hasattr(info, "weights") for info in infos):
         kinds = sorted({type(info).__name__ for info in infos})
-        raise ValueError(f"a history is made from a run or a list of reports, got {', '.join(kinds)}")
+        raise ValueError(f"a history is made from a run or a list of infos; got {', '.join(kinds)}")
     return infos
 
 

@@ -140,7 +140,7 @@ def identifiability_of(
     require_discounted(mdp)
     sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
     if not demonstration.lengths.any():
-        raise ValueError("the demonstration has no steps; without data nothing is determined")
+        raise ValueError("the demonstration must have steps; without data no direction is determined")
     if not scale > 0:
         raise ValueError(f"scale must be positive, got {scale}")
     require_possible(sensor, mdp, demonstration)
@@ -220,9 +220,9 @@ def _weak(
     words = combination(mdp.feature_names, vector, _MINOR)
     kind = NOT_VISITED if not at_hand[main].any() else WEAK
     why = (
-        "rewards what cannot be done in any state that was seen, so that only the way there tells"
+        "rewards pairs that are unavailable in all states seen, so only the paths there carry evidence"
         if kind == NOT_VISITED
-        else "made little difference to what was seen"
+        else "made little difference to the observations"
     )
     text = f"{words} {why}: {_sides(loss, scale)}"
     return Direction(vector, curvature**-0.5 if curvature > 0 else inf, loss, kind, text, False)
@@ -321,9 +321,9 @@ def identifiability_section(results: Mapping[str, Identifiability]) -> Section:
             )
             tables.append(Table(("kind", "standard error", "direction"), found, caption))
     text = (
-        "Behaviour determines a reward only up to changes that leave the behaviour alone. Where a direction "
-        "of the weights changes no behaviour at all, no amount of watching would tell. Where it is weakly "
-        "determined, prior belief decides: quite different weights explain what was seen as well.\n\n"
+        "Behaviour determines a reward only up to changes that leave the behaviour unchanged. If a direction "
+        "of the weights changes no behaviour at all, no amount of data determines it. If it is weakly "
+        "determined, the prior matters: quite different weights explain the observations as well.\n\n"
         + "\n\n".join(f"{title[:1].upper()}{title[1:]}: {_length(r)}" for title, r in results.items())
     )
-    return Section("What the demonstrations determine", text, tables)
+    return Section("Directions that the demonstrations determine", text, tables)

@@ -115,8 +115,8 @@ def expected_information(
 ) -> Float[np.ndarray, "K K"]:
     """Fisher information of ``trajectories`` of ``length`` steps of an expert with these weights.
 
-    ``trajectories E[score score']``, the expectation over what the sensor perceives averaged over ``draws``
-    simulated trajectories. Positive semidefinite.
+    ``trajectories E[score score']``, the expectation over observations averaged over ``draws`` simulated
+    trajectories. Positive semidefinite.
     """
     law = TrajectoryLaw(mdp, jnp.asarray(weights, float), sensor, length)
     gradients = scores(mdp, sensor, weights, sample_demonstration(key, law, draws))

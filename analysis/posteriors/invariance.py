@@ -49,7 +49,7 @@ class Direction(NamedTuple):
     kind : str
         One of the kinds named in this module.
     description : str
-        What it means, in terms of the features.
+        Its meaning, in terms of the features.
     exact : bool
         Whether it is exactly unidentified, as opposed to weakly determined.
     """
@@ -217,9 +217,9 @@ def _named(
         text = f"{words} is zero for every state and action"
     elif kind == CONSTANT:
         value = (features[pairs] @ (vector / np.abs(vector).max())).mean()
-        text = f"{words} is {abs(value):.3g} whatever is done, so that it rewards nothing in particular"
+        text = f"{words} is {abs(value):.3g} for every action, so it rewards no behaviour in particular"
     elif kind == SHAPING:
-        text = f"{words} only pays early for what it takes back later: {_potential(mdp, vector)}"
+        text = f"{words} pays early and takes the same back later: {_potential(mdp, vector)}"
     else:
         missed = reachable_states(mdp) & ~onward
         example = mdp.state_names[int(np.argmax(missed))]

@@ -26,7 +26,7 @@ def predictive_visits(
     sensor: AnySensor,
     demonstration: Demonstration | None = None,
 ) -> az.InferenceData:
-    """Add what the posterior predicts of how often each state is seen.
+    """Add the posterior's prediction of how often each state is seen.
 
     For every draw of the weights, as many trajectories of the same lengths are simulated from their soft
     policy and perceived through the same sensor; then steps seen (as read, where the sensor misreads) are
@@ -39,7 +39,7 @@ def predictive_visits(
     idata : arviz.InferenceData
         A posterior of :func:`~i2rl.inference.posteriors.weights.sample_posterior`.
     mdp, sensor
-        What it was sampled with.
+        Those of the posterior.
     demonstration : Demonstration, optional
         What to compare with; that of the group ``observed_data`` by default.
 
@@ -53,7 +53,7 @@ def predictive_visits(
     Raises
     ------
     InferenceDataError
-        For what is no posterior, or one of another MDP or sensor.
+        For data that are no posterior, or one of another MDP or sensor.
     ValueError
         For a demonstration without trajectories, or a sensor that does not fit the MDP.
     """
@@ -62,7 +62,7 @@ def predictive_visits(
     demonstration = _observed(idata) if demonstration is None else demonstration
     kind, state = np.asarray(demonstration.kind), np.asarray(demonstration.state)
     if not len(kind):
-        raise ValueError("the demonstration has no trajectories, so there is nothing to compare with")
+        raise ValueError("the demonstration must have trajectories to compare with; got none")
     counted = (kind != PAD) & (kind != LOST) & ~((kind == SEEN) & (state == UNKNOWN))
     flat = jnp.asarray(weights.values.reshape(-1, mdp.n_features))
     keys = jax.random.split(key, len(flat))

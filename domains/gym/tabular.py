@@ -22,9 +22,9 @@ class TabularEnv(gymnasium.Env[int, int]):
 
     Observations are states, actions the process's actions. ``info["action_mask"]`` (int8, ``[A]``) says at
     every reset and step which actions the state offers; ``env.action_space.sample(info["action_mask"])``
-    draws among them. An action that is not offered changes nothing, earns zero and sets ``info["available"]``
-    to False; with ``strict`` it raises a ``ValueError`` that names state and action. The reward of a step is
-    ``weights . phi(s, a)``, an expectation if features depend on the outcome.
+    draws among them. An action that is not offered leaves the state, earns zero and sets
+    ``info["available"]`` to False; with ``strict`` it raises a ``ValueError`` that names state and action.
+    The reward of a step is ``weights . phi(s, a)``, an expectation if features depend on the outcome.
 
     Episodes never terminate. ``reset(options={"state": ...})`` begins in a state given by number or name,
     otherwise the first state is drawn from the process's initial distribution.

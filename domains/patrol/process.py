@@ -1,10 +1,10 @@
 """Perimeter patrol (section 7.1.1, appendix C): robots walk hallways in loops, watched through a keyhole.
 
-Three instances on grids, each a reconstruction from the dissertation and its authors' released code where
-the two are silent or disagree (said at each place). Cells are ``(row, column)``, rows grow southward. A
+Three instances on grids, each a reconstruction from the dissertation and its authors' released code where the
+two are silent or disagree (said at each place). Cells are ``(row, column)``, rows grow southward. A
 patroller's state is a cell and a heading (and, in instance 1, the hallway whose end it visited last); it
-moves forward, turns left or right, or stops. The intended move succeeds with a fixed probability,
-otherwise nothing changes; one step takes two seconds.
+moves forward, turns left or right, or stops. The intended move succeeds with a fixed probability, otherwise
+the state stays; one step takes two seconds.
 """
 
 from __future__ import annotations
@@ -433,9 +433,9 @@ def boyd_with_rooms() -> Patrol:
     The turning feature fires on left turns in the hallways only, as in the released code (the dissertation
     says any turn). The learner's start, (0,17) facing west, is a reconstruction.
 
-    Two limits on what can be learned here. The features span a potential-based shaping (potential: being in
-    a room), so one direction of weights changes no behaviour and no data identifies it. And the patrollers
-    never enter a room, so what they would do inside, 56 of the 184 states, is known only by extrapolation.
+    Two limits on what can be learned here. The features span a potential-based shaping (potential: being in a
+    room), so one direction of weights changes no behaviour and no data identifies it. The patrollers never
+    enter a room, so their policy inside, in 56 of the 184 states, is an extrapolation.
     """
     first_room = [(r, 10) for r in range(1, 6)] + [(2, c) for c in range(4, 10)]
     second_room = [(5, c) for c in range(13, 16)]

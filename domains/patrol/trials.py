@@ -49,7 +49,7 @@ class GoAtBestTime(NamedTuple):
         """Decide whether to settle now, and on which step.
 
         ``waited`` and ``left`` are the steps waited so far and still allowed, ``values`` the plan's at the
-        start for each departure (``-inf`` beyond what is allowed).
+        start for each departure (``-inf`` beyond the allowed steps).
         """
         best = jnp.argmax(values)
         return values[best] > 0, best
@@ -70,7 +70,7 @@ class GoWhenBest(NamedTuple):
 
 
 class GoAtRandom(NamedTuple):
-    """The released code's random baseline: go at a time uniform over twice what is allowed."""
+    """The released code's random baseline: go at a time uniform over twice the allowed time."""
 
     def __call__(
         self, key: Array, waited: Int[Array, ""], left: Int[Array, ""], values: Float[Array, " T"]
@@ -143,9 +143,9 @@ def breach_trials(
     """Simulate trials: watch the patrol, learn, wait for a good moment, and try to reach the goal undetected.
 
     The patrollers start anywhere, follow their true optimal policies and pass each other as ``interaction``
-    says, all the while. The learner watches ``observed_steps`` steps, is blind while it learns, then watches
-    on until it leaves, planning anew at every step until it has settled on a departure (never later than it
-    may leave). It stays hidden until then; from then on it follows its plan by elapsed time.
+    says. The learner watches ``observed_steps`` steps, is blind while it learns, then watches on until it
+    leaves, planning anew at every step until it has settled on a departure (never later than it may leave).
+    It stays hidden until then; from then on it follows its plan by elapsed time.
 
     Parameters
     ----------

@@ -1,10 +1,10 @@
-"""Experts of the continuous tasks, trained by the package's own PPO, and what they were recorded doing.
+"""Experts of the continuous tasks, trained by the package's own PPO, and their recordings.
 
 ``make experts`` trains them all and writes ``recordings/``: for each task the policy's arrays, episodes, and
 the facts of both. The expert acts in them by the mode of its policy, without the noise it explored with, and
 each episode begins at a state of its own draw. The robots' episodes have full length whether or not the robot
-falls, for returns are compared "at fixed length" (section 7.4.3); the true rewards are stored beside what was
-observed and done.
+falls, for returns are compared "at fixed length" (section 7.4.3); the true rewards are stored beside the
+observations and actions.
 
 Needs the extra ``adversarial``.
 """

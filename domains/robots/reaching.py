@@ -11,7 +11,7 @@ released (:mod:`i2rl.domains.robots.onion_recordings`); it does **not** reproduc
 Two things are modelled rather than recorded:
 
 - *The arm.* Shoulder and elbow follow from the wrist. The shoulder rests at the recordings' median and leans
-  toward what is out of reach; upper arm (0.30 m) and forearm (0.20 m, to where the wrist was tracked) are the
+  toward targets out of reach; upper arm (0.30 m) and forearm (0.20 m, to where the wrist was tracked) are the
   recordings' median lengths; the elbow bends down, back and to the right. The authors used regressors that
   they fitted to their recordings.
 - *The hand.* Its place is the wrist's: an onion within 0.05 m of the wrist is held and moves with it. In the
@@ -123,7 +123,7 @@ class Outcome(NamedTuple):
 
 
 def move(observations: Float[Array, "... 29"], actions: Array, stride: float = STRIDE) -> Outcome:
-    """Move the wrist, and with it what it holds, by ``stride`` times the actions ``[..., 3]``, cut to ±1.
+    """Move the wrist, and the onion it holds, by ``stride`` times the actions ``[..., 3]``, cut to ±1.
 
     A held onion that comes into the bin is gone; one that comes to the belt's end lies there. Either earns 1
     if that is where its label belongs, or else costs 1; every step costs 0.001.
@@ -243,7 +243,7 @@ class OnionMover(NamedTuple):
         return onion_reaching().actions
 
     def mode(self, observations: Float[Array, "... 29"]) -> Float[Array, "... 3"]:
-        """Straight to the next way-point."""
+        """Move straight to the next way-point."""
         way, _ = _way(observations)
         return self._limited(way, jnp.asarray(_LONGEST, way.dtype))
 
@@ -269,7 +269,7 @@ class OnionMover(NamedTuple):
 
 
 def _way(observations: Float[Array, "... 29"]) -> tuple[Float[Array, "... 3"], Bool[Array, "..."]]:
-    """From the wrist to the mover's next way-point, and whether it may go on looking instead."""
+    """Return the displacement to the mover's next way-point, and whether it may go on inspecting instead."""
     seen = scene(observations)
     wrist, held = seen.wrist, seen.held
     look, into_bin, on_the_way, onto_end = (

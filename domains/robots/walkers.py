@@ -3,9 +3,9 @@
 The tasks of Gymnasium's ``Hopper-v5``, ``Walker2d-v5`` and ``HalfCheetah-v5`` with their own models, rewards
 and terminations, stepped by MuJoCo's threaded rollout instead of one Python object a robot. A state is
 MuJoCo's full physics, ``[time, positions, velocities]``, and a step is a pure function of it and the action:
-every step starts its contact solver cold, so that the same bits come out however many robots or threads are
-stepped together. Gymnasium starts the solver from the previous step, which moves what comes out by no more
-than the solver's tolerance.
+every step starts its contact solver cold, so that the bits are independent of the number of robots or threads
+stepped together. Gymnasium starts the solver from the previous step, which moves the result by no more than
+the solver's tolerance.
 
 Observations leave out the horizontal position ``x``, on which neither dynamics nor rewards depend. So the
 dynamics are also there as a function of the observation alone, with its Jacobians, which is what inference
@@ -107,7 +107,7 @@ class Locomotion(NamedTuple):
         return _simulator(self.name, self.threads).seconds
 
     def reset(self, key: Array, n: int) -> Float[np.ndarray, "n D"]:
-        """First states of ``n`` robots, the first of which are the same whatever ``n``.
+        """Draw first states of ``n`` robots; the first ones are the same for every ``n``.
 
         They are 32-bit numbers, so that the first observation of a recording says them exactly (but ``x``).
         """

@@ -186,7 +186,7 @@ def sort_belts(
     Parameters
     ----------
     key : random key
-        Belt ``i`` depends on it and on ``i`` alone, however long the sets stay.
+        Belt ``i`` depends on it and on ``i`` alone, for every duration of the sets.
     sorting : Sorting
         The process whose states the policy is about.
     policy : float ``[S, A]``

@@ -1,4 +1,4 @@
-"""A picture of the sorting table: where the onion is and what is thought of it, the hand, and the list."""
+"""A picture of the sorting table: the onion's place and prediction, the hand, and the list."""
 
 from __future__ import annotations
 

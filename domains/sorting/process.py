@@ -11,8 +11,8 @@ list)``. Three processes share one transition function and differ in their state
   iteration, which hid it).
 - :func:`pick_inspect_place`, the 22 states that section 7.1.2 speaks of, without the list.
 
-A feature is an expectation over an action's intended outcomes; a slip (5 %) changes nothing in the state and
-is not charged to the reward, as in the released code. :attr:`Sorting.transition_features` counts what really
+A feature is an expectation over an action's intended outcomes; a slip (5 %) leaves the state and is not
+charged to the reward, as in the released code. :attr:`Sorting.transition_features` counts what really
 happens, slips included. The hidden quality of an onion is not part of the process: precision and recall need
 the simulator of the whole table.
 """
@@ -145,7 +145,7 @@ class MixedDemonstration(NamedTuple):
 
 @cache
 def sorting_with_claiming() -> Sorting:
-    """26 states, 46 pairs, features that say what is done: the default for two and three tasks."""
+    """Build 26 states, 46 pairs, features of the actions: the default for two and three tasks."""
     states = _parsed(_STATES_WITH_CLAIMING)
     return _sorting("sorting with claiming", states, _with_claiming, _deeds, BEHAVIOURS, _normalised())
 

@@ -36,7 +36,7 @@ def test_steps_are_distributed_as_the_process_says(name):
     kernel = np.zeros((mdp.n_states, mdp.n_actions, mdp.n_states))
     pairs = np.indices(mdp.successors.shape)
     np.add.at(kernel, (pairs[0], pairs[1], np.asarray(mdp.successors)), np.asarray(mdp.probabilities))
-    # The pairs with the most to choose from, then some where nothing is left to chance.
+    # The pairs with the most successors, then some deterministic ones.
     spread = (kernel > 0).sum(-1)
     order = np.argsort(-spread, axis=None, kind="stable")
     order = order[np.asarray(mdp.available).ravel()[order]]

@@ -236,7 +236,7 @@ def part_seconds(task: NoisyTask, sessions: int = 20, replications: int = 200) -
             lambda log_policy, e: smooth_all(mdp, log_policy, Evidence(e, session.live)),
             (plan.log_policy, evidence),
         ),
-        "statistic of reports": (
+        "statistic of observations": (
             lambda logits, reports, pairs: report_statistic(
                 classes, logits, reports, reports.score[..., None, None], pairs
             ),
@@ -244,7 +244,7 @@ def part_seconds(task: NoisyTask, sessions: int = 20, replications: int = 200) -
         ),
         "fit of the sensor": (perception.fit, (heard, state.logits)),
         "fit of the reward": (lambda x: newton(mdp, x, slack, ridge, start), (working,)),
-        "preparing the reports": (lambda x: session_reports(classes, x), (one.bucketed(),)),
+        "preparing the observations": (lambda x: session_reports(classes, x), (one.bucketed(),)),
     }
     found = {}
     for name, (part, arguments) in parts.items():

@@ -59,8 +59,8 @@ def _peak_mib() -> float:
 def measure(n_states: int, discount: float) -> dict[str, float]:
     """Seconds, peak memory of this process (MiB) and Bellman residual of one size.
 
-    ``plan_seconds`` is by the wall clock once compiled; ``plan_cpu_seconds``, of all cores, says what it
-    costs on a busy machine too.
+    ``plan_seconds`` is by the wall clock once compiled; ``plan_cpu_seconds``, of all cores, is the cost on a
+    busy machine too.
     """
     mdp, build_seconds = _timed(local_moves, n_states, discount)
     build_peak = _peak_mib()

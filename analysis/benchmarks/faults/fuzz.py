@@ -422,7 +422,7 @@ def _bomb(name: str, head: bytes, megabytes: int, others: dict[str, bytes], size
 
 
 def crafted_archives() -> dict[str, bytes]:
-    """About two hundred archives that are meant to overwhelm or mislead a reader, by what is wrong."""
+    """Craft about two hundred archives that overwhelm or mislead a reader, by their fault."""
     base = plain_archive()
     arrays = _entries(base)
     rest = {name: content for name, content in arrays.items() if name != "features.npy"}

@@ -124,7 +124,7 @@ class Outcome(NamedTuple):
 
 
 def outcome(left: Left, peace: Content) -> Outcome:
-    """Look at what is left, learn on to the end, and compare with a journal that was left in peace."""
+    """Read the remaining journal, learn on to the end, and compare with an undisturbed journal."""
     found, total = [], len(peace.sessions)
     try:
         with Journal.read(left.path) as view:
@@ -304,7 +304,7 @@ _ORIGINS = ("''", "'{}'", "'[1]'", "'null'", "printf('%.*c', 100000, '[')", "'{\
 
 
 def _damage(path: Path, rng: np.random.Generator, sessions: int) -> str:
-    """Damage a journal's file in one random way, and say how."""
+    """Damage a journal's file at random; return a description."""
     data = bytearray(path.read_bytes())
     kind = rng.choice(["bits", "cut", "pages", "noise", "SQL"], p=[0.35, 0.1, 0.15, 0.1, 0.3])
     pages = len(data) // 4096

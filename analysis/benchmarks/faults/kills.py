@@ -76,7 +76,7 @@ class Ended(NamedTuple):
 class Kill(NamedTuple):
     """Kill: its intended phase, the sessions printed by this process, committed, and before it.
 
-    ``problem`` says in words what a copy of the journal, taken right after the kill, had wrong.
+    ``problem`` describes the fault of a copy of the journal, taken right after the kill.
     """
 
     phase: str
@@ -152,7 +152,7 @@ class Started(Protocol):
         """End it with SIGKILL."""
 
     def wait(self) -> tuple[int, str]:
-        """Its exit status, and what it said on standard error."""
+        """Return its exit status and its standard error."""
 
 
 Start = Callable[[Sequence[str], bool], Started]
@@ -290,7 +290,7 @@ def _become(folder: Path, arguments: Sequence[str], cached: bool) -> None:
 def run_until(learner: Started, instant: Instant, began: float) -> Ended:
     """Let a learner run, and kill it at an instant unless it ends before.
 
-    Raises ``RuntimeError`` with what it said if it fails by itself.
+    Raises ``RuntimeError`` with its message if it fails by itself.
     """
     reports, first, last, talking = 0, np.nan, np.nan, True
 
@@ -362,7 +362,7 @@ def _survive(
     peace = content(folder / "peace.db")
     total = len(peace.sessions)
     if first.reports != total or not total:
-        raise RuntimeError(f"{first.reports} sessions were reported, but {total} are in the journal")
+        raise RuntimeError(f"{first.reports} sessions were printed, but {total} are in the journal")
     problems = []
     cached = run(folder / "cached.db")
     compiled = run(folder / "compiled.db", cached=False) if shares.get("compiling") else cached
@@ -439,7 +439,7 @@ def _problem(found: Content, peace: Content, before: int, reports: int) -> str:
     if [s[0] for s in found.sessions] != list(range(1, committed + 1)):
         return "its sessions are not numbered 1, 2, ..."
     if committed < before + reports:
-        return f"{before + reports} sessions were reported, only {committed} are there"
+        return f"{before + reports} sessions were printed, only {committed} are there"
     if found.sessions != peace.sessions[:committed]:
         return "its sessions differ from those learned in peace"
     if [s for s, _ in found.state] != ([committed] if committed else []):

@@ -212,7 +212,7 @@ class Difference(NamedTuple):
 
 
 def difference(name: str, units: Float[np.ndarray, "number K"]) -> Difference:
-    """Largest differences of what a method learns in these units from what it learns in the original ones."""
+    """Compute the largest differences between learning in these units and in the original ones."""
     plain = np.asarray(METHODS[name](process()))
     expected = policies(process(), plain, name)
     worst = Difference(0.0, 0.0)

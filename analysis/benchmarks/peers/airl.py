@@ -3,8 +3,8 @@
 ``python -m i2rl.analysis.benchmarks.peers.airl --peer-python PATH`` (``make bench-peers`` prepares the peer's
 environment). Both sides learn from the same demonstrations with the same budget: Hopper with the
 dissertation's settings (4 environments x 256 steps a round, 4 discriminator updates of 256 pairs, PPO with
-minibatches of 64 and 10 epochs), and CartPole-v1 for 50,000 steps. Runs alternate, so that whatever else the
-machine does falls on both. Ours is timed from the second run on: the first compiles, and is given beside.
+minibatches of 64 and 10 epochs), and CartPole-v1 for 50,000 steps. Runs alternate, so that other load of the
+machine affects both. Ours is timed from the second run on: the first compiles, and is given beside.
 """
 
 from __future__ import annotations

@@ -15,7 +15,7 @@ the expert acts (50), which makes the gap the gradient of a convex dual. The jud
 and our tolerance is made smaller by 50 / 51 to make up for it.
 
 Each side runs in a process of its own, with one thread, pinned to one core, and the runs alternate, so that
-whatever else the machine does falls on both.
+other load of the machine affects both.
 """
 
 from __future__ import annotations

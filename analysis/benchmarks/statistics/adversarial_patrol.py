@@ -241,7 +241,7 @@ def _print(results: Mapping[str, Any]) -> None:
             breach = (f"{mean:.3f}", f"{spread:.3f}")
         rows.append((key, len(r["accuracy"]), float(final), float(half), *breach))
     print_table(
-        "Reports that err: LBA, mean of the last 15 sessions; breaches that succeed",
+        "Noisy observations: LBA, mean of the last 15 sessions; breaches that succeed",
         ("method, noise", "replications", "LBA", "+-", "success", "+-"),
         rows,
     )

@@ -1,8 +1,8 @@
 """Simulation-based calibration of the posterior (Talts et al. 2018).
 
-Weights drawn from the prior generate a demonstration, whose posterior is sampled. Over many replications
-the truth's rank among the draws is uniform if and only if model, NUTS and backward sampling agree: for
-every weight, for the log-likelihood, and for what the expert did out of view.
+Weights drawn from the prior generate a demonstration, whose posterior is sampled. Over many replications the
+truth's rank among the draws is uniform if and only if model, NUTS and backward sampling agree: for every
+weight, for the log-likelihood, and for the expert's behaviour out of view.
 
 Run as ``python -m i2rl.analysis.benchmarks.statistics.calibration``.
 """
@@ -171,7 +171,7 @@ def uniformity(ranks: Ranks, bins: int = 16) -> list[Uniformity]:
 def main(
     replications: Annotated[int, typer.Option(help="Simulated demonstrations.")] = 256,
     seed: Annotated[int, typer.Option(help="Random seed.")] = 0,
-    path: Annotated[Path, typer.Option(help="Where the JSON report goes.")] = Path(
+    path: Annotated[Path, typer.Option(help="File of the JSON results.")] = Path(
         "build/bench/calibration.json"
     ),
 ) -> None:

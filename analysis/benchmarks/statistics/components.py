@@ -71,7 +71,7 @@ def rerun(
 
 
 def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
-    """Wall-clock seconds of a call, and what it returned."""
+    """Return the wall-clock seconds of a call, and its result."""
     began = time.perf_counter()
     result = function(*arguments)
     return time.perf_counter() - began, result
@@ -242,12 +242,19 @@ def main() -> None:
                 float(np.median(column["online_seconds"] / column["batch_seconds"])),
             )
         )
-    columns = ("stream", "all ways found, online / batch", "EVD online", "EVD batch", "s online", "s batch")
+    columns = (
+        "stream",
+        "all components found, online / batch",
+        "EVD online",
+        "EVD batch",
+        "s online",
+        "s batch",
+    )
     print_table("Online against batch at every session", (*columns, "ratio"), rows)
 
     runs = record("late", late_component(sorting, 18, 6, seeds))
     print_table(
-        "A third way from the last third of 18 sessions of 6 on",
+        "A third component from the last third of 18 sessions of 6 on",
         ("two before", "three after", "mean accuracy", "mean EVD"),
         [
             (
@@ -274,7 +281,7 @@ def main() -> None:
                 float(np.median([run["seconds"] for run in runs])),
             )
         )
-    columns = ("trajectories", "all ways found", "mean accuracy", "least accuracy", "mean EVD", "s")
+    columns = ("trajectories", "all components found", "mean accuracy", "least accuracy", "mean EVD", "s")
     print_table("Half of the steps hidden", columns, rows)
 
     rows = []
@@ -282,17 +289,21 @@ def main() -> None:
         for tasks in (1, 2):
             for temperature in (0.5, 1.0):
                 runs = record(
-                    f"soft, sharpness {sharpness:g}, {tasks} tasks, price {temperature:g}",
+                    f"soft, sharpness {sharpness:g}, {tasks} tasks, temperature {temperature:g}",
                     soft_experts(sorting, sharpness, tasks, 64, temperature, seeds[:10]),
                 )
                 rows.append(
                     (
-                        f"sharpness {sharpness:g}, {tasks} tasks, price {temperature:g}",
+                        f"sharpness {sharpness:g}, {tasks} tasks, temperature {temperature:g}",
                         " ".join(str(run["n_components"]) for run in runs),
                         float(np.mean([run["accuracy"] for run in runs])),
                     )
                 )
-    print_table("Soft experts, 64 trajectories", ("experts", "ways found, by seed", "mean accuracy"), rows)
+    print_table(
+        "Soft experts, 64 trajectories",
+        ("experts", "components found, by replication", "mean accuracy"),
+        rows,
+    )
 
 
 if __name__ == "__main__":

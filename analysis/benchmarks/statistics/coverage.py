@@ -146,7 +146,7 @@ def main() -> None:
         ],
     )
     ignorance = {s.name: ignorance_gap(s.mdp, s.weights) for s in (small, patrol)}
-    print("Gap of knowing nothing (zero weights), nats:", ignorance)
+    print("Gap of zero weights, nats:", ignorance)
     sizes = sample_sizes(patrol)
     Console(width=200).print(sizes.to_string())
     planned = planned_coverage(jax.random.fold_in(key, 99), patrol, sizes, replications)

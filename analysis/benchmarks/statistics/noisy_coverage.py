@@ -62,7 +62,7 @@ class NoisySetting(NamedTuple):
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Names of what is judged: every weight, every reliability, and the log-likelihood."""
+        """Names of the judged quantities: every weight, every reliability, and the log-likelihood."""
         weights = (f"weight of {name}" for name in self.mdp.feature_names)
         return (*weights, *(f"reliability of {name}" for name in self.predicate_names), "log-likelihood")
 
@@ -320,7 +320,7 @@ def judge(quantities: tuple[str, ...], replications: Iterable[Run], kept: int = 
             )
         )
     if not rows:
-        raise ValueError("coverage is judged over at least one run")
+        raise ValueError("coverage is judged over at least one replication")
     covered, jointly, ranks, r_hat, ess, divergences = (np.array(x) for x in zip(*rows, strict=True))
     return CoverageStudy(quantities, covered, jointly, ranks, kept, r_hat, ess, divergences)
 

@@ -138,7 +138,7 @@ def main() -> None:
             for r in rows
         ],
     )
-    print("Gap of knowing nothing (zero weights), nats:", ignorance)
+    print("Gap of zero weights, nats:", ignorance)
     # Sorting as section 7.4.3 has it, and as the theorem asks: as long as discounting with 0.99 leaves 0.015.
     needed = {steps: perception_needed(11, 8, steps, 0.15, 0.8) for steps in (3, 418)}
     for steps, table in needed.items():

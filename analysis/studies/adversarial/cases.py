@@ -79,7 +79,7 @@ class Case(NamedTuple):
     expert : its policy
     demonstrations : Recording, of all that may be shown
     expert_return : float
-    sensor, assumed : the sensor, and what is believed of it where it is learned
+    sensor, assumed : the sensor, and its prior if it is learned
     noise : str, the sensor in words
     truth : ``(draws=) -> GaussianTruth`` or a like object
     fit : ``(truth, chain, policy, sensor) -> sensor``

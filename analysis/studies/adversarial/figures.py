@@ -365,7 +365,7 @@ def cells_plot(
     high: Sequence[float],
     theme: Theme,
 ) -> Figure:
-    """LBA in every cell of mountain car's states: where a policy does what the expert does."""
+    """LBA in every cell of mountain car's states: the places where a policy agrees with the expert."""
     n = len(cells)
     figure = new_figure(theme, max(2.9 * n + 1.2, 6.0), 3.7)
     panels = np.atleast_1d(figure.subplots(1, n, sharey=True))

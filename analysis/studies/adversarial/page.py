@@ -129,7 +129,7 @@ def recovery_table(results: AdversarialResults) -> Table:
 
 
 def correlation_table(results: AdversarialResults) -> Table:
-    """Correlation of learned and true rewards, beside Table 7.4; each seed's own interval is in the file."""
+    """Tabulate correlations of learned and true rewards, beside Table 7.4; the file has all intervals."""
     printed = TABLE_7_4.get(results.domain, {})
     rows = []
     for name, result in results.methods.items():
@@ -288,7 +288,7 @@ def _printed_recovery(domain: str, method: str) -> float | None:
 
 
 def _tables(results: AdversarialResults) -> dict[str, Table]:
-    """Those that have rows, by what they are about."""
+    """Return the tables with rows, by their subject."""
     made = {
         "learning": learning_table(results),
         "recovery": recovery_table(results),

@@ -177,7 +177,7 @@ def success_rates(
 
 
 def interval(values: Float[np.ndarray, "R ..."]) -> tuple[np.ndarray, np.ndarray]:
-    """Mean over replications, and half the width of its 95 % interval (Student), zero for one run."""
+    """Compute the mean over replications and half its 95 % interval (Student), zero for one replication."""
     band = seed_interval(values)
     return band.mean, np.nan_to_num(band.high - band.mean)
 

@@ -63,10 +63,10 @@ class MethodResult(NamedTuple):
         LBA in [0, 1], over the states that :attr:`AdversarialResults.accuracy_over` says.
     returns : float ``[replications, T]`` or None
         Mean true return of the learned policy after each session.
-    correlations : RewardCorrelation a seed, after the last session; or none
-    errors : EmpiricalILE a seed, after the last session; or none
+    correlations : RewardCorrelation a replication, after the last session; or none
+    errors : EmpiricalILE a replication, after the last session; or none
     breaches : float ``[replications]`` or None
-        Share of breaches of the patrol that succeed with what was learned in the end.
+        Share of successful breaches of the patrol with the final policy.
     seconds : float or None
         Median of a session, once compiled.
     """
@@ -151,7 +151,7 @@ class AdversarialResults(NamedTuple):
     methods : mapping from a name of :data:`METHODS` to MethodResult
     accuracy_over : str, the states of LBA in words
     expert_return : float or None
-    scatters : mapping from a method's name to RewardScatter, of one seed
+    scatters : mapping from a method's name to RewardScatter, of one replication
     belief : Belief or None
     frames : FrameStrip a row
     cells : mapping from a method's name to LBA in each cell ``[cells, cells]`` of mountain car, mean of

@@ -70,7 +70,7 @@ class Outcome(NamedTuple):
     scatter : RewardScatter
     error : EmpiricalILE
     sensor : float ``[T, p]``, the learned sensor (a covariance's diagonal); else empty
-    episode : float ``[t, d]``, the beginning of an episode of what was learned
+    episode : float ``[t, d]``, the beginning of an episode of the learned policy
     belief : Belief or None
     cells : float ``[Q, Q]``, LBA of each cell; empty where there are none
     """
@@ -214,7 +214,7 @@ def _scatter(name: str, plan: Plan, network: Any, seed: int) -> RewardScatter:
 
 
 def _error(of: Case, network: Any, policy: Any, key: Array) -> EmpiricalILE:
-    """By the learned reward: what was demonstrated, before noise, and what the learner does."""
+    """By the learned reward: the demonstration before noise, and the learner's behaviour."""
     shown = of.demonstrations
     own = simulate(of.level, policy, key, 10, shown.live.shape[1], deterministic=True)
     return bounded_ile(
@@ -316,7 +316,7 @@ def _frames(name: str, shown: Mapping[str, Outcome]) -> tuple[FrameStrip, ...]:
 
 
 def _settings(plan: Plan, repeats: Mapping[str, Sequence[Outcome]]) -> dict[str, Any]:
-    """For the file: the plan, the budget of each method, and what was learned of the sensor."""
+    """For the file: the plan, the budget of each method, and the learned sensor."""
     told = {**{k: v for k, v in plan._asdict().items() if k != "settings"}, **dict(plan.settings)}
     told["environment steps"] = {m: int(outcomes[0].steps[-1]) for m, outcomes in repeats.items()}
     if LEARNED in repeats:
@@ -362,7 +362,7 @@ def _kept(name: str, method: str, seed: int, plan: Plan, folder: Path | None) ->
         return Outcome(**fields)
     outcome = run(name, method, seed, plan)
     path.parent.mkdir(parents=True, exist_ok=True)
-    # In one step: a run that is interrupted must not leave half a file, which would be found again.
+    # In one step: an interrupted replication must not leave half a file, which a later run would load.
     part = path.with_suffix(".part")
     part.write_text(json.dumps(plain(outcome._asdict())))
     part.replace(path)

@@ -3,8 +3,7 @@
 Object World with deterministic moves, a finite number of steps and no discount in a trajectory's total
 reward, where the law of maximum entropy is ``P(X) = exp(reward(X)) / Z`` exactly; ``Z`` sums over where a
 trajectory begins as well. Bayesian IRL multiplies ``pi(a | s) ~ exp(rationality Q*(s, a))`` over the pairs,
-each normalised over the actions of its own state: that is where the number of choices met on the way comes
-in.
+each normalised over the actions of its own state: this adds the number of choices on the path.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ BOLTZMANN, OPTIMAL, MAXENT = EXPERTS
 
 
 class Setting(NamedTuple):
-    """One way to fill in what the dissertation leaves open.
+    """One choice of the settings that the dissertation leaves open.
 
     ``expert`` demonstrates: ``Boltzmann`` follows the very law that BIRL scores with, ``optimal`` shares its
     steps evenly among the best actions, ``maximum entropy`` follows the law that MaxEnt scores with.
@@ -55,7 +54,7 @@ class Setting(NamedTuple):
 
     @property
     def name(self) -> str:
-        """For example ``Boltzmann experts, rationality 1``; what is as in the first setting goes unsaid."""
+        """For example ``Boltzmann experts, rationality 1``; settings equal to the first are left out."""
         parts = [f"{self.expert} experts", f"eta {self.rationality:g}"]
         parts += [f"discount {self.discount:g}"] * (self.discount != DISCOUNT)
         parts += [f"{self.steps} steps"] * (self.steps != STEPS)
@@ -81,11 +80,11 @@ SETTINGS = (
 
 
 class Trajectories(NamedTuple):
-    """Expert trajectories and what is made of them.
+    """Expert trajectories and their statistics.
 
     ``states, actions [n, T]``; ``reward [n]`` undiscounted; ``maxent`` and ``birl [n]`` log-likelihoods in
-    nats (BIRL's without the start, which it has no law for); ``choice [n]``, the nats that BIRL takes off
-    for choices met on the way, ``sum_t log sum_a exp(rationality (Q(s_t, a) - max Q(s_t)))``. BIRL is
+    nats (BIRL's without the start, which it has no law for); ``choice [n]``, the nats that BIRL subtracts for
+    choices on the path, ``sum_t log sum_a exp(rationality (Q(s_t, a) - max Q(s_t)))``. BIRL is
     ``rationality`` times the sum of advantages, less ``choice``.
     """
 

@@ -80,8 +80,8 @@ class Prediction(NamedTuple):
     bits_out_of_view : float ``[n]``
         The part of it spent on decisions in states the learner never sees.
     afterwards : float
-        Bits per decision over the whole recording under what had been learned by its end: what the method
-        can express, as far as its prior lets it.
+        Bits per decision over the whole recording under what had been learned by its end: the method's
+        capacity, within its prior.
     parameters : int
         Free numbers it learns.
     """

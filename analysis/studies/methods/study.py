@@ -52,12 +52,12 @@ _TUNING = 7919
 
 
 def methods_table(mdp: TabularMDP, demonstration: Demonstration | None = None) -> pandas.DataFrame:
-    """Table 8.1 as it stands in this library: what each method's reward is and what it carries on.
+    """Table 8.1 as it stands in this library: each method's reward and memory.
 
-    One row per method, ``reward`` and ``statistic`` being what they are made of and ``reward numbers`` and
-    ``statistic numbers`` how many floats that is, counted in the learner's own state on ``mdp``. Random keys,
-    session counters and warm starts, which follow from the rest, are neither. With a ``demonstration``
-    batch LME is added as a contrast: it keeps every pair (two numbers) of what was seen so far.
+    One row per method: ``reward`` and ``statistic`` name the parts, ``reward numbers`` and ``statistic
+    numbers`` count their floats in the learner's own state on ``mdp``. Random keys, session counters and warm
+    starts, which follow from the rest, are neither. With a ``demonstration`` batch LME is added as a
+    contrast: it stores every pair seen so far (two numbers).
     """
     import pandas
 

@@ -122,7 +122,7 @@ class Strip(NamedTuple):
 
     @property
     def believed(self) -> float:
-        """Mean posterior probability of what happened, over steps that were misreported; NaN without."""
+        """Mean posterior probability of the truth, over wrongly observed steps; NaN without."""
         wrong = (self.seen.state != self.truth.state) | (self.seen.action != self.truth.action)
         steps = np.flatnonzero(wrong[0])
         mass = self.posterior[steps, self.truth.state[0, steps], self.truth.action[0, steps]]
@@ -166,7 +166,7 @@ def sorted_belts(
     """Tally the expert's and the learned policies on simulated belts, beside the table of Figure 7.9.
 
     The replications of a method share about ``belts`` belts, equally many each and at least one. Its tally
-    has one entry a run, the sum over that run's belts: belts sorted with one policy are not independent. A
+    has one entry a replication, the sum over its belts: belts sorted with one policy are not independent. A
     method whose name begins with that of a published row has it beside it.
     """
     sorting, line = pick_inspect_place(), Line()

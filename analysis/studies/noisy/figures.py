@@ -351,7 +351,7 @@ def strip_plot(strip: Strip, mdp: TabularMDP, theme: Theme) -> Figure:
 
 
 def _pair_names(mdp: TabularMDP, pairs: np.ndarray) -> list[str]:
-    """State and action, without what is the same in all states."""
+    """Name state and action, without the parts that all states share."""
     parts = [name.split(", ") for name in mdp.state_names]
     alike = len({len(p) for p in parts}) == 1
     varies = [not alike or len(set(column)) > 1 for column in zip(*parts, strict=False)]

@@ -103,7 +103,7 @@ def summary(study: NoisyStudy) -> dict[str, Any]:
 
 
 def _reward(study: NoisyStudy) -> list[dict[str, Any]] | None:
-    """Weights of the first run, learned and drawn from the posterior of its early sessions."""
+    """Return the first replication's weights, learned and drawn from the posterior of its early sessions."""
     if study.posterior is None or study.posterior.reward is None:
         return None
     band = quantile_band(study.posterior.reward, 0.95)

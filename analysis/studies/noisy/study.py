@@ -90,7 +90,7 @@ class MeanInterval(NamedTuple):
 
 
 def mean_interval(replications: Float[np.ndarray, "replications ..."]) -> MeanInterval:
-    """Mean over the first axis, with the normal distribution's interval; NaN at its ends for one run."""
+    """Compute the mean over the first axis with a normal interval; its ends are NaN for one replication."""
     replications = np.asarray(replications, float)
     mean, n = replications.mean(0), len(replications)
     half = 1.96 * replications.std(0, ddof=1) / np.sqrt(n) if n > 1 else np.full_like(mean, np.nan)
@@ -185,7 +185,7 @@ class SensorDoubt(NamedTuple):
     Fields
     ------
     erratic, optimal : float ``[replications, J]``
-        Agreement of the task's predicates, by what is assumed of the expert.
+        Agreement of the task's predicates, by the assumption about the expert.
     identified : bool ``[replications, J]``
     """
 
@@ -496,7 +496,7 @@ def noisy_study(
 def _seconds(methods: Sequence[str], task: NoisyTask, streams: Streams) -> dict[str, float]:
     """Time the first stream, learned twice: the first time compiles.
 
-    Learners take turns, so that whatever else the machine does slows all of them alike.
+    Learners take turns, so that other load of the machine slows all of them equally.
     """
     learners = [LEARNERS[method].learner(streams.mdp, task) for method in methods]
     for _ in range(2):

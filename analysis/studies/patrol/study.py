@@ -193,7 +193,7 @@ def patrol_study(
         results.append(_evaluated(patrol, observability, name, learned, keys, sessions, trials))
     first = results[0]
     stretch = _stretch(jax.random.fold_in(keys[0], 7), patrol, observability, first.weights[0, 0, -1])
-    # What the first run's demonstrations say of each patroller, where something was learned from them.
+    # The directions that the first replication's demonstrations determine, for each patroller learned.
     known = data[0] if first.name not in (RANDOM, TRUE) else ()
     determined = tuple(
         identifiability_of(patrol.mdp, view, demonstration, jnp.asarray(weights[-1]))
@@ -342,7 +342,7 @@ def _evaluated(
 
 
 def _stretch(key: jax.Array, patrol: Patrol, observability: int, weights: np.ndarray) -> Stretch:
-    """One round of a patroller that was not learned from, and what the learned weights say about it."""
+    """One round of a patroller outside the training data, and its posterior under the learned weights."""
     policy = jnp.log(jnp.asarray(patrol.expert_policy()))[None]
     first, walk, look = jax.random.split(key, 3)
     # Started in view, so that the first hidden gap lies between two sightings.

@@ -79,7 +79,8 @@ def feature_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.nd
 
 
 def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
-    """Trajectories of the first run on two principal components of feature counts, a panel a method.
+    """Draw the first replication's trajectories on two principal components of feature counts, a panel a
+    method.
 
     The marker is the true component; the colour the component found.
     """
@@ -144,7 +145,7 @@ def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
         )
         for d in range(min(most, _COLOURS))
     ]
-    head(figure, theme, handles, title=f"{counted(len(study.labels), 'trajectory')}, first run")
+    head(figure, theme, handles, title=f"{counted(len(study.labels), 'trajectory')}, first replication")
     told = ";\n".join(f"component {k + 1}: {_loading(mdp, embedding.loadings[k])}" for k in range(2))
     foot(figure, theme, told)
     return figure
@@ -179,10 +180,10 @@ Place = tuple[int, int]
 
 
 class Flow(NamedTuple):
-    """A policy over places (where the onion is, what is thought of it) and actions.
+    """Policy over places (the onion's place and prediction) and actions.
 
     ``visits`` are shares of steps at each place; ``moves`` of steps that go from one place to another by an
-    action. Both leave out what is rare.
+    action. Both leave out rare transitions.
     """
 
     visits: dict[Place, float]
@@ -217,8 +218,8 @@ def flow_of(sorting: Sorting, policy: Float[np.ndarray, "S A"], steps: int) -> F
 def components_diagram(study: SortingStudy, theme: Theme) -> Figure:
     """Draw each component found as a state diagram of an onion, of the first method of the study.
 
-    Boxes are where the onion is and what is thought of it (hand and list left out); arrows are what the
-    greedy policy of the learned weights does.
+    Boxes are the onion's place and prediction (hand and list left out); arrows are the greedy policy of the
+    learned weights.
     """
     result, sorting = study.results[0], study.sorting
     sizes = np.bincount(result.found.assignments)
@@ -359,7 +360,7 @@ def _border(centre: tuple[float, float], towards: tuple[float, float]) -> tuple[
 
 
 def evd_plot(study: SortingStudy, theme: Theme) -> Figure:
-    """EVD against trajectories: every run a dot, the mean a line, a bar over all replications.
+    """Draw EVD against trajectories: every replication a dot, the mean a line, a bar over all replications.
 
     The scale is logarithmic down to a power of ten below the smallest value that is not zero, and linear
     from there to zero.

@@ -76,7 +76,8 @@ def summary(study: SortingStudy) -> dict[str, Any]:
 
 
 def _estimates(study: SortingStudy) -> dict[str, Estimates]:
-    """Weights of every way that the first method found in the first run, named after what it is like.
+    """Return the weights of every component of the first method in the first replication, named after its
+    behaviour.
 
     Errors of maximum-entropy methods are those of the posterior's curvature under a normal prior of scale
     :data:`PRIOR_SCALE`, given who did what: experts who never err leave most directions to the prior. Other

@@ -63,7 +63,7 @@ class Measures(NamedTuple):
     value_difference : float
         EVD, in units of discounted true reward, a trajectory.
     n_components : int
-        Ways that are the likeliest of some trajectory.
+        Components that are the likeliest of some trajectory.
     accuracy : float
         Share of trajectories rightly assigned, under the best matching.
     rand : float
@@ -89,7 +89,7 @@ class MethodResult(NamedTuple):
         How many it had learned from when it was measured.
     measures : Measures
     found : Clustering
-        What it made of all trajectories of the first run.
+        Its assignment of all trajectories of the first replication.
     """
 
     name: str

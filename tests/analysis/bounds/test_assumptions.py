@@ -1,4 +1,4 @@
-"""A bound knows what it rests on, and is not quoted where that fails."""
+"""Assumptions of a bound, which is quoted only if they hold."""
 
 import dataclasses
 

@@ -19,7 +19,9 @@ BITS = np.array(list(itertools.product([0, 1], repeat=4)))
 
 
 def likelihoods(reliabilities):
-    """Probability of each report (second) of each truth (first): two steps of two predicates."""
+    """Compute the probability of each observation (second) of each truth (first): two steps of two
+    predicates.
+    """
     agree = BITS[:, None] == BITS[None]
     p = np.tile(reliabilities, 2)
     return np.where(agree, p, 1 - p).prod(axis=2)
@@ -53,7 +55,7 @@ def test_reports_and_posteriors_are_within_their_distances(seed, error):
 
 @given(st.integers(0, 2**32 - 1), st.floats(1e-4, 0.15))
 def test_the_mean_over_reports_changes_by_the_distance_of_reports_at_most(seed, error):
-    """The corrected lemma's step, exactly: any prior, any features, the truth's own reports."""
+    """Check the corrected lemma's step, exactly: any prior, any features, the truth's own observations."""
     rng = np.random.default_rng(seed)
     true = rng.uniform(0.2, 0.8, 2)
     counted = true + error * rng.choice([-1, 1], 2)
@@ -65,7 +67,7 @@ def test_the_mean_over_reports_changes_by_the_distance_of_reports_at_most(seed, 
 
 
 def one_predicate(belief, reliability):
-    """Posterior of a truth of probability ``belief`` after each report, no and yes."""
+    """Compute the posterior of a truth of probability ``belief`` after each observation, no and yes."""
     yes = belief * reliability / (belief * reliability + (1 - belief) * (1 - reliability))
     no = belief * (1 - reliability) / (belief * (1 - reliability) + (1 - belief) * reliability)
     return np.array([no, yes])
@@ -106,7 +108,7 @@ def test_two_truths_can_attain_the_bound_by_odds():
     change = (one_predicate(belief, counted) - one_predicate(belief, true))[1]
     noise = [FeatureNoise(np.array([[[0], [1]]]), np.array([p])) for p in (true, counted)]
     assert change < model_distance(*noise).over(1)[1]
-    # A report moves one likelihood up and the other down.
+    # An observation moves one likelihood up and the other down.
     belief = 1 / (1 + np.sqrt(odds * (true / (1 - true)) ** 2))
     change = (one_predicate(belief, counted) - one_predicate(belief, true))[1]
     assert change == pytest.approx(model_distance(*noise).over(1)[1], rel=1e-9)
@@ -124,7 +126,7 @@ def test_models_of_independent_predicates_are_as_far_apart_as_enumerated():
 
 
 def test_normalised_over_what_can_be_reported_a_reliability_is_no_probability():
-    """One pair of a hundred has the predicate: 0.99 reports it rightly half of the time."""
+    """Check a predicate of one pair of a hundred: 0.99 observes it correctly half of the time."""
     holds = (np.arange(100) == 7).reshape(1, 50, 2)
     found = model_distance(FeatureNoise(holds, np.array([0.99])), FeatureNoise(holds, np.array([0.995])))
     assert found.variation > 30 * 0.005
@@ -148,7 +150,7 @@ def test_what_cannot_be_compared_is_refused():
     with pytest.raises(ValueError, match="epsilon_o must be positive, got 0"):
         observation_distance(perception._replace(epsilon_o=0.0))
     noise = binary_noise([0.9, 0.9, 0.9])
-    with pytest.raises(ValueError, match="without an observation model"):
+    with pytest.raises(ValueError, match="both sensors must have observation models"):
         model_distance(noise, Visibility(np.ones(4)))
     with pytest.raises(ValueError, match="truths mark some of the pairs"):
         model_distance(noise, noise, np.zeros((4, 2), bool))

@@ -94,7 +94,7 @@ def test_reports_that_say_nothing_teach_nothing_under_the_learners_own_weights()
     theorem = rimeo_confidence(10**5, 10**5, 0.01, 0.01, perception, 2, 0.8)
     assert theorem.confidence > 0.99
     assert theorem.error < nothing / 2
-    # Whatever was reported, the posterior under zero weights has the features of zero weights.
+    # For every observation the posterior under zero weights has the features of zero weights.
     mdp, expert = setting.mdp, expert_of(setting.mdp, setting.weights)
     nobody = expert_of(mdp, jnp.zeros(2))
     codes = simulate_codes(jax.random.key(6), mdp, expert, setting.sensor.reading, 4, 30, 50)

@@ -656,10 +656,10 @@ def test_the_patrol_study_writes_its_page(tmp_path, page_faults):
     assert page_faults(page) == []
     told = json.loads(result.stdout)
     assert told["provenance"].keys() >= {"i2rl", "command", "seed", "versions"}
-    patrollers = told["reward"]["learned, first run"]
+    patrollers = told["reward"]["learned, first replication"]
     assert [p["patroller"] for p in patrollers] == ["the first patroller", "the second patroller"]
     for p, weights in zip(
-        patrollers, told["reward"]["by method, run and patroller"]["LME-I2RL"][0], strict=True
+        patrollers, told["reward"]["by method, replication and patroller"]["LME-I2RL"][0], strict=True
     ):
         assert [w["weight"] for w in p["weights"]] == weights
         assert all(

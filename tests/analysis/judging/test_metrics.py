@@ -145,7 +145,8 @@ def test_chance_is_the_accuracy_of_weights_drawn_at_random() -> None:
     drawn = np.asarray(jax.random.uniform(key, (40, 2), float, -0.99, 0.99))
     alone = [float(metrics.evaluate(mdp, [1.0, 0.0], list(w)).accuracy.overall) for w in drawn[:8]]
     np.testing.assert_allclose(found[:8], alone)
-    # Whoever likes the left end and not the right one acts as the expert; the other way round nobody does.
+    # Weights for the left end and against the right one give the expert's actions; the opposite weights do
+    # not.
     assert (found[(drawn[:, 0] > 0) & (drawn[:, 1] < 0)] == 1).all()
     assert (found[(drawn[:, 0] < 0) & (drawn[:, 1] > 0)] == 0).all()
     assert found.min() < found.max()

@@ -58,7 +58,7 @@ BINS = 10
 
 @pytest.fixture(scope="module")
 def stuck():
-    """Four chains: one sits apart in a weight, another never moves in the next, nothing moves in the last."""
+    """Make four chains: one lies apart in a weight, one never moves in the next, none moves in the last."""
     weights = np.random.default_rng(0).normal(size=(4, 60, 4))
     weights[2, :, 1] = 3 + 0.01 * weights[2, :, 1]
     weights[3, :, 2] = 1.7

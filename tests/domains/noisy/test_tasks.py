@@ -98,7 +98,7 @@ def test_patrol_predicates_say_what_their_names_say_and_none_is_constant() -> No
     np.testing.assert_array_equal(task.predicates, expected)
     among_the_expert = (task.predicates * task.pair_distribution("natural", 5)).sum((1, 2))
     assert ((among_the_expert > 0.01) & (among_the_expert < 0.99)).all()
-    # The other reading of "y is 0".
+    # The other meaning of "y is 0".
     assert not any(state.column == 0 for state in states)
 
 
@@ -236,7 +236,8 @@ def test_injected_errors_occur_as_often_as_the_model_says(name: str, of: str) ->
     n_actions = task.mdp.n_actions
     g, o = flat(data.truth, n_actions), flat(data.seen, n_actions)
     size = task.mdp.n_states * n_actions
-    # Given the truths, reports are independent: for every truth seen often, a chi-square of its reports.
+    # Given the truths, observations are independent: for every frequent truth, a chi-square of its
+    # observations.
     table = table_of(noise).reshape(size, size)
     assert (table[g, o] > 0).all()
     statistic, freedom = 0.0, 0
@@ -318,7 +319,9 @@ def test_calibrated_scores_are_calibrated(name: str, of: str) -> None:
 
 
 def test_scores_of_swaps_have_the_distribution_of_the_clarity() -> None:
-    """Over right and wrong reports together, the score of a pair with one swap has the stated Beta."""
+    """Check the score of a pair with one swap: over right and wrong observations together it has the stated
+    Beta.
+    """
     task = patrol_task()
     data = demonstrate_noisy(jax.random.key(5), task, sessions=MANY, scores="calibrated", concentration=6.0)
     action, score = data.truth.action.reshape(-1), np.asarray(data.seen.score).reshape(-1)

@@ -50,7 +50,7 @@ def _at_end(x, y, z):
 
 
 def _by_the_rules(wrist, onions, action, stride):
-    """One step told in words: ``onions`` is a list of ``(x, y, z, label)``."""
+    """Compute one step from named parts: ``onions`` is a list of ``(x, y, z, label)``."""
     moved = [
         min(max(w + stride * min(max(a, -1.0), 1.0), low), high)
         for w, a, low, high in zip(wrist, action, (0.2, -0.65, 0.75), (0.95, 0.70, 1.30), strict=True)

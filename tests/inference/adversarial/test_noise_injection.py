@@ -226,7 +226,7 @@ def same(one, other) -> bool:
 
 @pytest.fixture(scope="module")
 def sessions(learner, demonstration):
-    """States and reports of three sessions."""
+    """Compute states and infos of three sessions."""
     kept = []
     run_sessions(
         learner, [demonstration] * 3, key=jax.random.key(0), on_session=lambda *both: kept.append(both)

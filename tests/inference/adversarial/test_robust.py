@@ -219,7 +219,7 @@ def test_a_journal_refuses_another_truth(generator, truth, sensor, tmp_path, cha
     other = gaussian_truth(jax_dynamics(moved), 2, **{"draws": 3, **change})
     with pytest.raises(JournalError, match="truth settings"):
         Journal.open(tmp_path / "run.journal", robust_airl(generator, other, sensor))
-    # The same made again is the same: nothing of it is known by where it lies in memory.
+    # A second construction is equal: equality is independent of memory addresses.
     again = robust_airl(generator, gaussian_truth(jax_dynamics(moved), 2, draws=3), sensor)
     Journal.open(tmp_path / "run.journal", again).close()
 
@@ -272,7 +272,7 @@ def test_a_look_samples_on_until_the_average_logit_settles(generator, truth, sen
     _, once = session()
     state, strict = session(change=0.002, draws=12)
     _, loose = session(change=0.2, draws=12)
-    assert once.draws.tolist() == [1, 1]  # of three rounds, the first and the third look
+    assert once.draws.tolist() == [1, 1]  # of three iterations, the first and the third refresh
     assert (strict.draws > loose.draws).all()
     assert (loose.draws >= 2).all()
     assert np.isfinite(state.weights).all()
@@ -292,7 +292,7 @@ def test_sampling_on_leaves_the_chain_and_the_dynamics_alone(task, truth, sensor
 
 
 def test_reported_actions_are_cut_to_what_the_generator_can_show(generator, reports):
-    # Noise beyond the bounds would tell an expert from a generator whatever they do.
+    # Noise beyond the bounds would separate an expert from a generator for all behaviours.
     beyond = reports._replace(actions=5 * jnp.ones_like(reports.actions))
     cut = reports._replace(actions=jnp.ones_like(reports.actions))
     learner = airl(generator, training=TRAINING)

@@ -1,4 +1,4 @@
-"""A jumble seen whole and the same jumble, completed, are explained alike."""
+"""Explanations of mixed demonstrations, wholly seen or completed, are equal."""
 
 from dataclasses import replace
 

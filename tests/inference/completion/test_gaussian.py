@@ -80,9 +80,10 @@ def affine_problem(lengths=(4, 6)):
 
 
 def least_squares(reported, i, sensor=SENSOR, prior=1.0):
-    """Posterior of one trajectory as one weighted least-squares problem in all its pairs; and its evidence.
+    """Solve one trajectory's posterior as one weighted least-squares problem in all its pairs; return its
+    evidence.
 
-    Rows ``J x - b`` with their covariance, one a factor of the model: nothing is eliminated or reordered.
+    Rows ``J x - b`` with their covariance, one a factor of the model, without elimination or reordering.
     """
     length, D = int(reported.lengths[i]), d + k
     o, b_a = np.asarray(reported.observations[i]), np.asarray(reported.actions[i])

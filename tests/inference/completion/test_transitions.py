@@ -1,4 +1,4 @@
-"""Transitions behind reports: against enumeration, dense matrices, and each other."""
+"""Transitions behind observations: against enumeration, dense matrices, and each other."""
 
 from __future__ import annotations
 

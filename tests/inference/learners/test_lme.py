@@ -250,7 +250,7 @@ def test_the_same_key_gives_the_same_bits(mdp, sensor, demonstration):
 def test_a_harmonic_slack_meets_equation_4_3_in_every_session(mdp, statistic):
     full = sample_demonstration(jax.random.key(2), TrajectoryLaw(mdp, TRUE, Sensor(), 6), 4)
     c = 0.05
-    # One E- and M-step: what is kept of whole trajectories is what was fitted, up to the filled-in tail.
+    # One E- and M-step: the statistic of whole trajectories is the fitted one, up to the filled-in tail.
     learner = me_i2rl(mdp, statistic=statistic, slack=Harmonic(c), iterations=60, tolerance=1e-9)
     state = learner.init(jax.random.key(0))
     for i, demonstration in enumerate(full.sessions(1), start=1):
@@ -350,7 +350,7 @@ def test_a_schedule_that_turns_negative_late_is_refused_when_it_does(mdp, sensor
     state, _ = learner.update(state, demonstration)
     with pytest.raises(ValueError, match=r"gives -0\.25 in session 1025"):
         learner.update(state, demonstration)
-    # A fleet raises nothing, but its weights stay what they were.
+    # A fleet cannot raise, but its weights stay unchanged.
     one = jax.tree.map(lambda x: x[None], state)
     after, _ = fleet(learner).update(one, jax.tree.map(lambda x: x[None], demonstration))
     assert np.array_equal(after.weights[0], state.weights)

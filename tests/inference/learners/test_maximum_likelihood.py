@@ -72,7 +72,7 @@ def test_the_marginal_likelihood_of_em_never_falls(mdp, trajectories, log_likeli
     assert (np.diff(trace.log_likelihoods, axis=1) >= -1e-8).all()
     weights, proportions, responsibilities, objective = trace.clustering
     assert objective == trace.log_likelihoods[:, -1].max()
-    # What is reported belongs together, by the definition of a mixture.
+    # The results are consistent by the definition of a mixture.
     counts = visit_counts(mdp, trajectories)
     joint = np.log(proportions) + np.stack([log_likelihood(w, counts) for w in weights], axis=1)
     assert np.logaddexp.reduce(joint, axis=1).sum() >= objective - 1e-8
@@ -87,7 +87,7 @@ def test_two_ways_are_told_apart(mdp, trajectories, log_likelihood):
     found, truth = clustering.assignments, np.repeat([0, 1], 8)
     counts = visit_counts(mdp, trajectories)
     oracle = np.stack([log_likelihood(w, counts) for w in TRUE], axis=1)
-    # No method can do better than somebody who knows both rewards.
+    # The true rewards are the best of all methods.
     best = (oracle.argmax(1) == truth).mean()
     assert max((found == truth).mean(), (found != truth).mean()) >= best - 1 / 16
     assert clustering.objective >= np.logaddexp.reduce(oracle + np.log(0.5), axis=1).sum()

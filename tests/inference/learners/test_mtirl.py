@@ -1,4 +1,4 @@
-"""MME-MTIRL finds how many ways of sorting there are, who did what, and the reward of each."""
+"""MME-MTIRL finds the components of sorting, their trajectories and their rewards."""
 
 import warnings
 from dataclasses import replace
@@ -123,7 +123,7 @@ def test_online_finds_what_batch_finds_and_a_way_that_comes_late(sorting, online
         sorting.mdp, sorting.weights, labels, found.weights, shares.argmax(1), demonstration
     )
     assert loss == 0
-    # Nothing of old trajectories is kept but these sums (Eq. 5.7 and 5.8).
+    # The state holds only these sums of old trajectories (Eq. 5.7 and 5.8).
     np.testing.assert_allclose(float(state.mass.sum()), 36, atol=1e-9)
     np.testing.assert_allclose(float(state.visits.sum()), 36 * STEPS, atol=1e-6)
 

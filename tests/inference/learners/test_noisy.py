@@ -76,7 +76,7 @@ def test_knowing_the_truth_is_the_upper_bound_of_the_alternation():
     reports, happened = concatenate(seen), concatenate(truth)
     psi = task().features
     share = (psi[:, reports.state, reports.action] == psi[:, happened.state, happened.action]).mean((1, 2))
-    # The slack of a quarter of a report, and forgetting, are all that stands between.
+    # Only the slack of a quarter of an observation, and forgetting, differ.
     assert np.abs(run.infos[-1].agreement - share).max() < 0.06
 
 
@@ -90,7 +90,7 @@ def test_alternations_climb_the_exact_likelihood_of_the_reports():
     start = learner.init(KEY)
     values = []
     for _ in range(5):
-        # Begun again where it was left, with nothing kept: one alternation on the same reports.
+        # Resumed without memory: one alternation on the same observations.
         state, report = learner.update(start, everything)
         sensor = FeatureNoise(psi, np.asarray(jax.nn.sigmoid(state.logits)))
         law = TrajectoryLaw(mdp, state.weights, sensor, 3)
@@ -307,7 +307,7 @@ def test_a_report_no_truth_could_give_is_named_and_costs_nothing():
     possible = next(x for x in seen if not ((x.state == barred[0]) & (x.action == barred[1])).any())
     after, fresh = (learner.update(x, possible)[1] for x in (state, learner.init(KEY)))
     np.testing.assert_array_equal(after.agreement, fresh.agreement)
-    # In a fleet, which raises nothing, an impossible session leaves everything as it was.
+    # In a fleet, which cannot raise, an impossible session leaves the state unchanged.
     assert learner.session is not None
     left, report = jax.jit(learner.session)(state, seen[0].bucketed())
     assert np.isneginf(report.demonstration_log_likelihood)

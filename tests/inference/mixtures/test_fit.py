@@ -65,7 +65,7 @@ def trajectories(mdp, sensor, demonstration):
 
 @pytest.fixture(scope="module")
 def whole(mdp):
-    """Visits of twelve trajectories that nothing was hidden of."""
+    """Compute the visits of twelve wholly seen trajectories."""
     sensor = Visibility(np.ones(5, bool))
     laws = [TrajectoryLaw(mdp, jnp.array(w), sensor, LENGTH) for w in ([3.0, -2.0, 1.0], [-2.0, 3.0, -3.0])]
     codes = [np.asarray(law.sample(jax.random.key(i), (6,))) for i, law in enumerate(laws)]
@@ -73,7 +73,7 @@ def whole(mdp):
 
 
 def started(mdp, trajectories, seed, n_components=WAYS):
-    """Random assignments, and the visits that follow from them when nothing is known of any reward."""
+    """Draw random assignments, and compute their visits without any reward."""
     shares = jax.random.dirichlet(jax.random.key(seed), jnp.ones(n_components), trajectories.live.shape)
     shares = shares * trajectories.live[:, None]
     return shares, jnp.einsum("nd,nsa->dsa", shares, without_reward(mdp, trajectories).visits)
@@ -160,7 +160,7 @@ def test_the_climb_ends_where_every_part_is_best(mdp, program, whole):
 
 
 def test_mergers_that_are_not_tried_would_not_have_paid(mdp, program):
-    """Trajectories seen whole spare mergers; the same ones, completed where nothing is missing, do not."""
+    """Compare wholly seen trajectories, which save mergers, with the same ones completed, which do not."""
     sensor = Visibility(np.ones(5, bool))
     laws = [TrajectoryLaw(mdp, jnp.array(w), sensor, LENGTH) for w in ([1.8, -1.2, 0.6], [-1.2, 1.8, -1.8])]
     codes = [np.asarray(law.sample(jax.random.key(i), (6,))) for i, law in enumerate(laws)]

@@ -1,4 +1,4 @@
-"""The posterior over several ways of doing a task, by two samplers and by enumeration."""
+"""Posterior over the components of a mixture, by two samplers and by enumeration."""
 
 from functools import partial
 from typing import NamedTuple
@@ -55,7 +55,9 @@ def sensor():
 
 @pytest.fixture(scope="module")
 def demonstration(mdp, sensor):
-    """Three trajectories of each of two ways; some are hidden in places, a frame is lost, one is short."""
+    """Simulate three trajectories of each of two components; some steps are hidden, a frame is lost, one is
+    short.
+    """
     codes = np.concatenate(
         [
             np.asarray(simulated(jax.random.key(seed), mdp, jnp.array(w), sensor, 3))
@@ -258,7 +260,7 @@ def test_a_biased_sampler_is_found_out(posteriors):
 
 
 def test_without_information_partitions_follow_the_process(demonstration, sensor):
-    """Nobody wants anything: features are zero, and the posterior is the prior."""
+    """Check the prior: with zero features the posterior is the prior."""
     indifferent = ring(np.zeros((4, 2, 2)))
     partitions = partitions_of(N)
     (chance, _), components = weighed(partitions), partitions.max(1) + 1

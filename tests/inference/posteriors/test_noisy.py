@@ -118,7 +118,8 @@ def test_bad_input_is_refused_in_its_own_terms(toy, demonstration):
 
 
 def test_chains_start_in_both_modes_where_both_hold_something(toy):
-    # One predicate and its own negative as the only feature: reports wrong, weights turned, is as likely.
+    # One predicate and its own negative as the only feature: wrong observations with reversed weights are as
+    # likely.
     action = np.tile(np.arange(2), (3, 1))
     mdp = replace(toy, features=jnp.asarray(action[..., None] - 0.5))
     told = np.concatenate([np.zeros((90, 1), int), np.ones((10, 1), int)])

@@ -64,7 +64,7 @@ def one_hot(mdp: TabularMDP) -> TabularMDP:
 
 
 def dense_expectations(mdp: TabularMDP, policies: np.ndarray, discount: float) -> np.ndarray:
-    """Feature expectations by dense matrix products, sharing nothing with the package's sweeps."""
+    """Compute feature expectations by dense matrix products, independent of the package's recursions."""
     dense = np.zeros((mdp.n_states, mdp.n_actions, mdp.n_states))
     for s, a in np.ndindex(mdp.n_states, mdp.n_actions):
         np.add.at(dense[s, a], np.asarray(mdp.successors[s, a]), np.asarray(mdp.probabilities[s, a]))
@@ -196,11 +196,11 @@ def enumerate_trajectories(mdp: TabularMDP, horizon: int) -> tuple[list[list[tup
 
 @pytest.mark.parametrize("seed", range(3))
 def test_deterministic_law_is_maximum_entropy_over_enumerated_trajectories(seed: int):
-    """Eq. 2.2: ``P(X) ~ exp(theta . f(X))`` and causal entropy coincide where nothing is left to chance."""
+    """Check Eq. 2.2: ``P(X) ~ exp(theta . f(X))`` and causal entropy coincide in deterministic processes."""
     mdp, horizon = deterministic_mdp(seed), 5
     paths, sums = enumerate_trajectories(mdp, horizon)
     rng = np.random.default_rng(seed + 20)
-    # A target nobody's soft policy made: the features of an arbitrary law over trajectories.
+    # A target of no soft policy: the features of an arbitrary law over trajectories.
     target = rng.dirichlet(np.ones(len(paths))) @ sums
     fit = fit_weights(mdp, horizon, target, tolerance=1e-9)
     log_law = sums @ fit.weights - special.logsumexp(sums @ fit.weights)

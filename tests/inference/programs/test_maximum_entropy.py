@@ -91,7 +91,7 @@ def random_weights(seed, n_features=3):
 
 
 def problem(seed):
-    """Twenty problems of 8 to 20 states; some lack actions, one has states nobody reaches."""
+    """Make twenty problems of 8 to 20 states; some lack actions, one has unreachable states."""
     sizes = {0: 8, 1: 14, 5: 20}
     return random_mdp(seed, sizes.get(seed % 6, 8), masked=seed % 3 == 1, islands=3 if seed == 5 else 0)
 

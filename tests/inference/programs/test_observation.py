@@ -12,7 +12,7 @@ from i2rl.models.observation.agreement import predicate_classes, reported_matche
 
 
 def random_problem(seed, n_predicates=3, shape=(5, 3), hidden=0.0):
-    """Predicates, reliabilities, weights of truths, and what can be reported."""
+    """Make predicates, reliabilities, weights of truths, and the possible observations."""
     rng = np.random.default_rng(seed)
     predicates = rng.random((n_predicates, *shape)) < 0.5
     reportable = rng.random(shape) >= hidden
@@ -116,7 +116,7 @@ def test_reliabilities_are_recovered_from_simulated_reports():
     reports = (rng.random((len(truths), 1)) > np.cumsum(table, 1)[truths]).sum(1)
     matches = reported_matches(predicates, *np.divmod(reports, 4), np.eye(24)[truths].reshape(-1, 6, 4))
     solution = ObservationProgram(predicates).solve(matches.weights, matches.agreement)
-    # An agreement of 40 000 reports has a standard error of at most 0.0025.
+    # An agreement of 40 000 observations has a standard error of at most 0.0025.
     np.testing.assert_allclose(solution.reliabilities, reliabilities, atol=0.02)
 
 
@@ -168,7 +168,7 @@ def test_a_constant_predicate_is_named_and_stays_at_one_half():
 
 
 def test_predicates_that_differ_only_where_the_truth_never_is():
-    # Of three that exclude each other, a truth in the first class tells of the first against the rest only.
+    # With three exclusive predicates, a truth in the first class determines only the first against the rest.
     predicates = np.stack([np.arange(3)[:, None] == j for j in range(3)])
     assert unidentified_predicates(predicates).groups == ()
     first = np.array([[1.0], [0.0], [0.0]])

@@ -18,10 +18,10 @@ def problem(request):
 
 
 def unidentified(mdp):
-    """Directions in which weights change no behaviour, as orthonormal columns.
+    """Find directions in which weights change no behaviour, as orthonormal columns.
 
-    Instance 3's features span a potential-based shaping (Ng, Harada and Russell 1999) with the potential
-    "in a room": entering gains what leaving and staying lose. No data can tell such weights apart.
+    Instance 3's features span a potential-based shaping (Ng, Harada and Russell 1999) with the potential "in
+    a room": entering gains what leaving and staying lose. Such weights are unidentifiable from data.
     """
     if mdp.n_features != 5:
         return np.zeros((mdp.n_features, 0))

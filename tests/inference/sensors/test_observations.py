@@ -36,7 +36,7 @@ FEATURES = np.array(
     [[[0, 1], [0, 1], [0, 1], [0, 1]], [[0, 0], [0, 0], [1, 1], [2, 2]], [[1, 1], [1, 0], [0, 0], [1, 1]]]
 )
 LOGITS = np.array([1.1, 0.6, -0.4])
-# One of the two equal pairs cannot be reported, nor can one that nothing equals.
+# One of the two equal pairs cannot be observed, nor can one without an equal.
 MASK = np.array([[0, 1], [1, 1], [1, 1], [0, 1]], bool)
 EVERYTHING = np.ones((S, A), bool)
 MODES = ["none", "stepwise", "averaged"]
@@ -108,7 +108,9 @@ def confidences(mode: str, rows: list, mask: np.ndarray) -> Confidences:
 
 
 class Happened(NamedTuple):
-    """One step's probabilities of truth and report ``[SA, SA]`` given the truth: by kind of report."""
+    """Compute one step's probabilities of truth and observation ``[SA, SA]`` given the truth: by kind of
+    observation.
+    """
 
     plain: np.ndarray
     right: np.ndarray
@@ -120,7 +122,7 @@ def happened(step: tuple, confidence: np.ndarray, logits: np.ndarray, mask: np.n
     _, s, a, _ = step
     named = np.array([s in (UNKNOWN, x) and a in (UNKNOWN, y) for x, y in product(range(S), range(A))])
     scored = ~np.isnan(confidence)
-    # No report of what cannot be reported is right.
+    # Truths that cannot be observed have only wrong observations.
     c = np.where(scored & mask.ravel(), confidence, 0.0)[:, None]
     return Happened(
         plain * named * ~scored[:, None], np.eye(SA) * named * c, wrong * named * (1 - c) * scored[:, None]
@@ -286,7 +288,7 @@ def test_expected_matches_are_the_slope_of_the_likelihood(mode):
 
 
 class Problem(NamedTuple):
-    """Shares of plain and of wrong reports, truth first ``[SA, SA]``, and of right ones."""
+    """Compute shares of plain and of wrong observations, truth first ``[SA, SA]``, and of right ones."""
 
     plain: np.ndarray
     wrong: np.ndarray
@@ -325,12 +327,12 @@ class Problem(NamedTuple):
 
 
 def problem(seed: int, mask: np.ndarray, scored: float = 0.6, clarity: float = 0.0) -> Problem:
-    """Random reports; with ``clarity`` of one all but the scored and wrong are right in every predicate."""
+    """Draw observations; with ``clarity`` one all but the scored and wrong are right in every predicate."""
     rng = np.random.default_rng(seed)
     said = mask.ravel()
     plain = rng.dirichlet(np.ones(SA), SA) * (1 - clarity) + clarity * agreements().all(0)
     wrong = rng.dirichlet(np.ones(SA), SA) * (1 - np.eye(SA))
-    # Of a truth that nothing reportable is like, anything is reported.
+    # A truth unlike every possible observation has a uniform observation.
     plain, wrong = (x * said + 1e-6 * said * (1 - np.eye(SA)) for x in (plain, wrong))
     plain, wrong = (x / x.sum(1, keepdims=True) for x in (plain, wrong))
     truths = rng.dirichlet(np.ones(SA), 2)
@@ -442,7 +444,7 @@ def test_equal_predicates_share_what_is_known_of_them():
 
 
 def test_what_only_wrong_reports_tell_is_identified_by_them():
-    # Three pairs that exclude each other: plain reports are of the third, wrong ones of the first.
+    # Three exclusive pairs: plain observations are of the third, wrong ones of the first.
     features = np.arange(3)[:, None] == np.arange(3)[:, None, None]
     plain, wrong = np.array([[0.0], [0.0], [1.0]]), np.array([[1.0], [0.0], [0.0]])
     assert unidentified_predicates(features, plain).groups == ((0, 1, 2),)

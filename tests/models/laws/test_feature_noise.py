@@ -11,7 +11,7 @@ from i2rl.models import FeatureNoise
 from i2rl.models.laws.feature_noise import observation_feature_model, sample_observation_features
 from i2rl.models.observation.agreement import ReportedMatches
 
-# Every combination of two predicates once: what is right of one says nothing of the other.
+# Every combination of two predicates once: the two are independent.
 INDEPENDENT = np.array([[0, 0, 1, 1], [0, 1, 0, 1]], bool).reshape(2, 2, 2)
 REPORTED = ReportedMatches(np.array([[10.0, 20.0], [5.0, 15.0]]), np.array([43.0, 30.0]))
 SCORES = np.array([0.25, 1.0, 0.32, 0.0, np.nan, 0.3, 0.38, 0.21])

@@ -1,4 +1,4 @@
-"""The declared model of several ways of doing a task."""
+"""Declared model of a mixture of behaviours."""
 
 import itertools
 from functools import partial

@@ -1,4 +1,4 @@
-"""Confusions: one object that injects errors and knows their probability."""
+"""Confusions: one object that injects errors and gives their probability."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Imperfections: their evidence, their products, and observations that nothing could have produced."""
+"""Sensors: their evidence, their products, and impossible observations."""
 
 from __future__ import annotations
 

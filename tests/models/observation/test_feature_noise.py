@@ -1,4 +1,4 @@
-"""Noise on features: a distribution over reports, whose likelihood is that of enumeration."""
+"""Noise on features: a distribution over observations, whose likelihood is that of enumeration."""
 
 from itertools import product
 

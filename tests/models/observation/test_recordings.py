@@ -1,4 +1,4 @@
-"""Recordings are checked at the border; sensors report with the frequencies they claim."""
+"""Recordings are checked on input; sensors observe with their stated frequencies."""
 
 from __future__ import annotations
 

@@ -7,7 +7,7 @@ from i2rl.domains.patrol.process import instance
 from i2rl.models import StorageError, TabularMDP
 from i2rl.models.observation.storage import load_mdp, save_mdp
 
-# Digests of the patrols as journals have kept them since before starts kept their bits.
+# Digests of the patrols in journals older than exact starts.
 PATROLS = {1: "c49075472716", 2: "2e475c8a9004", 3: "26d6963d4c83"}
 
 

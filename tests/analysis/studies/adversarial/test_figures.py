@@ -170,13 +170,13 @@ def test_an_unknown_share_is_no_point_on_the_axis(patrol):
     assert "not known" in axes.texts[0].get_text()
     assert not [line for line in axes.lines if line.get_marker() not in (None, "None", "")]
     assert [len(line.get_xdata()) for line in axes.lines] == [2]  # the target alone
-    assert figure.get_supxlabel() == "one seed a row, no interval"
+    assert figure.get_supxlabel() == "one replication a row, no interval"
 
 
 def test_one_seed_has_no_interval_of_its_share(patrol):
     methods = {m: r._replace(accuracy=r.accuracy[:1]) for m, r in patrol.methods.items()}
     rows = recovery_table(patrol._replace(methods=methods, replications=1)).rows
-    assert rows[-1][1].endswith("(one seed, no interval)")
+    assert rows[-1][1].endswith("(one replication, no interval)")
 
 
 def test_a_constant_reward_has_no_correlation_in_the_figure(hopper):

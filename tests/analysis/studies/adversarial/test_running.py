@@ -1,4 +1,4 @@
-"""``i2rl run robust-airl`` on patrol: the report it writes, what it prints, and what it refuses."""
+"""``i2rl run robust-airl`` on patrol: its page, its output, and its errors."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def told(tmp_path_factory):
     folder = tmp_path_factory.mktemp("report")
     small = partial(patrol_results, trials=TRIALS, iterations=3)
     command = ["run", "robust-airl", "--domain", "patrol", "--replications", "1", "--sessions", str(SESSIONS)]
-    # Next to nothing is computed: compilation is what takes time.
+    # Compilation takes nearly all of the time.
     jax.config.update("jax_disable_most_optimizations", True)
     try:
         with pytest.MonkeyPatch.context() as patch:
@@ -54,7 +54,7 @@ def told(tmp_path_factory):
 def test_every_method_is_told_in_json(told):
     _, printed = told
     assert [m["method"] for m in printed["methods"]] == [CLEAN, NOISY, ROBUST, LEARNED]
-    assert printed["settings"]["probability of a misreport"] == pytest.approx(4 * 0.05)
+    assert printed["settings"]["probability of a wrong observation"] == pytest.approx(4 * 0.05)
     for method in printed["methods"]:
         accuracy, pairs = np.array(method["accuracy"]), np.array(method["pairs"])
         assert accuracy.shape == (1, SESSIONS)
@@ -107,7 +107,7 @@ def test_reports_without_an_error_have_nothing_to_show():
     ("noise", "message"),
     [
         ("0", "noise is a multiple, above zero, of the study's own; got 0.0"),
-        ("21", "noise multiplies the probability of 0.05 that a report errs, .* at most 20; got 21.0"),
+        ("21", "noise multiplies the probability of 0.05 that an observation errs; .* at most 20; got 21.0"),
     ],
 )
 def test_noise_that_cannot_be_is_refused(tmp_path, noise, message):

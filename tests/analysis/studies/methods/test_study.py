@@ -76,7 +76,7 @@ def test_every_method_is_measured_at_the_same_pairs():
     for curve in study.curves:
         assert curve.accuracy.shape == (2, len(study.points))
         assert ((curve.accuracy >= 0) & (curve.accuracy <= 1)).all()
-    # Learned from nothing, DARKO stays where it began until the first goal is reached.
+    # DARKO stays at its start until it reaches the first goal.
     waiting = next(curve for curve in study.curves if curve.name == "DARKO, goals").accuracy
     assert (waiting[:, 0] == waiting[:, 1]).all()
     best = next(curve for curve in study.curves if curve.name == "LME-I2RL, seen")

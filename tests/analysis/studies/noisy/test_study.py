@@ -77,7 +77,7 @@ def test_streams_are_the_demonstration_cut_into_runs_and_sessions():
             np.testing.assert_array_equal(ours, theirs)
     whole = streams.whole(1, "truth")
     np.testing.assert_array_equal(whole.state, np.asarray(drawn.truth.state)[4:8])
-    # Some reports are wrong, or there would be nothing to learn about.
+    # Some observations are wrong, or the sensor would be trivial.
     assert (np.asarray(streams.seen.state) != np.asarray(streams.truth.state)).any()
 
 
@@ -134,7 +134,7 @@ def test_an_infallible_sensor_believes_what_it_sees():
     np.testing.assert_allclose(drawn.posterior.sum((1, 2)), 1, atol=1e-9)
     seen = np.arange(12), drawn.seen.state[0], drawn.seen.action[0]
     available = np.asarray(task().mdp.available)[seen[1:]]
-    # Features do not tell apart whether an onion that is held was judged good or is unknown.
+    # Features are equal for an onion in hand that was judged good and for an unknown one.
     believed = np.argmax(drawn.posterior.reshape(12, -1), axis=1)
     features = task().features.reshape(10, -1)
     flat = seen[1] * task().mdp.n_actions + seen[2]
@@ -156,7 +156,7 @@ def test_page_has_every_method_and_both_themes(tmp_path, page_faults):
     study = small()
     page = noisy_report.write(study, tmp_path).read_text()
     assert page_faults(page) == []
-    # What was measured of sorting onions is told of no other task.
+    # Results of sorting onions appear in no other task.
     assert "96.7 s" in page
     assert "96.7 s" not in noisy_report.pace_table(study._replace(belts=None)).caption
     stored = json.loads((tmp_path / "results.json").read_text())

@@ -248,7 +248,8 @@ def test_command_writes_its_page(tmp_path, monkeypatch, page_faults):
     assert told == json.loads((tmp_path / "results.json").read_text())
     assert [m["method"] for m in told["methods"]] == ["DPM-BIRL", "EM-MLIRL"]
     assert told["methods"][0]["trajectories"] == [6]
-    assert len(told["components of the first run"]) == len(set(small().results[0].found.assignments.tolist()))
+    found = set(small().results[0].found.assignments.tolist())
+    assert len(told["components of the first replication"]) == len(found)
     page = (tmp_path / "index.html").read_text()
     assert page_faults(page) == []
     assert "EM-MLIRL" in page

@@ -171,7 +171,7 @@ def test_the_figure_shows_both(theme):
         [r.tally.recall().value for r in table().rows if r.behaviour == "pick-inspect-place"],
     )
     np.testing.assert_allclose([line.get_xdata()[0] for line in diamonds], [7 / 12, 7 / 12, 7 / 12, 6 / 12])
-    assert [t.get_text() for t in panels[0].texts] == ["nothing binned"]
+    assert [t.get_text() for t in panels[0].texts] == ["no onion binned"]
     figure.draw_without_rendering()
 
 

@@ -1,4 +1,4 @@
-"""Adversarial learners with exact expert and generator: objective, optimum, imperfections, sessions."""
+"""Adversarial learners with exact expert and generator: objective, optimum, sensors, sessions."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_gradient_of_the_objective_is_that_of_finite_differences(mdp, expert, se
     slope = jax.jit(jax.grad(loss))(leaves)
     rng = np.random.default_rng(0)
     direction = [jnp.asarray(rng.normal(size=x.shape)) for x in leaves]
-    # What the running normaliser knows of inputs is no parameter.
+    # The running normaliser's statistics are no parameters.
     fixed = [name for name, leaf in enumerate(leaves) if not np.asarray(slope[name]).any()]
     direction = [d * (i not in fixed) for i, d in enumerate(direction)]
     h = 1e-6
@@ -186,7 +186,7 @@ def test_knowing_what_the_expert_does_its_policy_is_recovered(mdp, expert, watch
     for _ in range(4):
         state, report = learner.update(state, watched[0].select([0]))
     assert _distance(state.log_policy, expert) < 0.04 < begun / 5
-    # Nothing is left to tell apart.
+    # The two are indistinguishable.
     assert report.loss[-1] == pytest.approx(np.log(2), abs=0.01)
 
 
@@ -222,7 +222,7 @@ def test_hidden_and_wrong_reports_cost_little_where_they_are_understood(
 
     assert mean_distance(known) < 0.6 * mean_distance(taken)
     assert mean_distance(sensor_learned) < 0.6 * mean_distance(taken)
-    # A session in which nothing was seen says nothing to those who believe their eyes.
+    # A wholly hidden session carries no evidence for learners without a model of occlusion.
     blank = watched[1].select(slice(0, 64))
     blank = replace(blank, kind=np.where(blank.kind > 0, HIDDEN, blank.kind), state=0 * blank.state - 1)
     fresh = at_face_value.init(jax.random.key(0))

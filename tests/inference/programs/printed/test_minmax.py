@@ -165,7 +165,7 @@ def test_ascent_leaves_the_accuracy_of_a_random_start(two_tasks, variant):
     starts = np.random.default_rng(7).dirichlet(np.ones(2), (30, 16))
     ended = [ascend_printed(space, start, variant)[0] for start in starts]
     before, after = np.mean([*map(accuracy, starts)]), np.mean([*map(accuracy, ended)])
-    # An arbitrary labelling of 16 is, up to the names of the ways, right in 59.8 % on average.
+    # An arbitrary assignment of 16 is, up to the order of the components, right in 59.8 % on average.
     assert after < before + 0.05
 
 
