@@ -21,7 +21,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -318,6 +318,22 @@ class NoisyDemonstration(NamedTuple):
     mdp: TabularMDP
 
 
+class Scoring(NamedTuple):
+    """Options for the scores of reports, see :func:`demonstrate_noisy`."""
+
+    scores: Scores | None = None
+    concentration: float = CONCENTRATION
+    reliabilities: np.ndarray | None = None
+
+
+class ScoringOptions(TypedDict, total=False):
+    """:class:`Scoring` as keyword arguments."""
+
+    scores: Scores | None
+    concentration: float
+    reliabilities: np.ndarray | None
+
+
 def demonstrate_noisy(
     key: Array,
     task: NoisyTask,
@@ -327,15 +343,14 @@ def demonstrate_noisy(
     trajectories: int = 2,
     steps: int = 3,
     starts: Starts = "all",
-    scores: Scores | None = None,
     view: Visibility | None = None,
-    concentration: float = CONCENTRATION,
-    reliabilities: np.ndarray | None = None,
+    **scoring: Unpack[ScoringOptions],
 ) -> NoisyDemonstration:
     """Simulate the task's optimal expert and report it through ``noise`` (by default the task's own).
 
     Session ``i`` is ``trajectories`` rows of ``steps`` pairs (``seen.sessions(trajectories)``); section
-    7.4.3 has two of three. Every trajectory starts afresh. ``view`` hides steps as well. Scores are
+    7.4.3 has two of three. Every trajectory starts afresh. ``view`` hides steps as well. ``scores`` are (with
+    ``concentration``, 4 by default, and ``reliabilities``, none by default)
 
     - ``"calibrated"``, the perception's probability of having made no mistake. At every step each swap of the
       noise has a clarity ``u ~ Beta`` of mean one minus its noise and ``alpha + beta = concentration``, and
@@ -348,11 +363,12 @@ def demonstrate_noisy(
       ``1 - p_j`` for those it has wrong, with the given ``reliabilities [J]``; by default those of a
       :class:`FeatureNoise`, otherwise the agreement probabilities among the expert's pairs. It is no
       probability that the report is right, and takes knowledge of the truth that no perception has.
-    - None: no scores.
+    - None (the default): no scores.
 
     Raises ``ValueError`` for other words, sizes below one, a concentration or reliabilities that are none,
     and noise or a view for another number of states or actions.
     """
+    scores, concentration, reliabilities = Scoring(**scoring)
     if min(sessions, trajectories, steps) < 1:
         raise ValueError(
             f"sessions, trajectories and steps must be at least 1, got {sessions}, {trajectories} and {steps}"

@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ....domains.patrol.process import FORWARD, LEFT, RIGHT, Patrol, instance
-from ....domains.patrol.trials import breach_trials
+from ....domains.patrol.trials import Watching, breach_trials
 from ....inference.adversarial.tabular.learners import (
     airl_tabular,
     robust_airl_tabular,
@@ -162,8 +162,8 @@ def success_rates(
     for i, policy in enumerate(policies):
         both = jnp.broadcast_to(jnp.log(jnp.asarray(policy)), (patrol.patrollers, *policy.shape))
         outcome = breach_trials(
-            jax.random.fold_in(jax.random.key(seed), i), patrol, both, observability=100,
-            observed_steps=STEPS, trials=trials,
+            jax.random.fold_in(jax.random.key(seed), i), patrol, both, watching=Watching(100, STEPS),
+            trials=trials,
         )  # fmt: skip
         rates.append(outcome.rate())
     return np.array(rates)

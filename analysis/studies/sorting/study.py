@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
 import numpy as np
@@ -154,18 +154,33 @@ class _Stream(NamedTuple):
     labels: Int[np.ndarray, " n"]
 
 
+class Design(NamedTuple):
+    """Independent ``runs`` from a ``seed``, ``steps`` of a trajectory, simulated ``belts`` of Table 7.2."""
+
+    runs: int = 3
+    seed: int = 0
+    steps: int = STEPS
+    belts: int = 300
+
+
+class DesignOptions(TypedDict, total=False):
+    """:class:`Design` as keyword arguments."""
+
+    runs: int
+    seed: int
+    steps: int
+    belts: int
+
+
 def sorting_study(
     tasks: int = 2,
     counts: Sequence[int] | None = None,
     *,
-    runs: int = 3,
-    seed: int = 0,
     methods: Sequence[str] | None = None,
     sessions: int | None = None,
     n_components: int = DEFAULT_COMPONENTS,
-    steps: int = STEPS,
-    belts: int = 300,
     advance: Advance = lambda description, fraction: None,
+    **design: Unpack[DesignOptions],
 ) -> SortingStudy:
     """Learn the sorters' ways with every method, from more and more of the same trajectories.
 
@@ -176,8 +191,6 @@ def sorting_study(
     counts : sequence of int, optional
         Numbers of trajectories, about as many of each behaviour. By default :data:`FEW` of them;
         :data:`GRID` has the dissertation's.
-    runs, seed : int
-        Independent repetitions. A smaller number of trajectories is the beginning of a larger one's.
     methods : sequence of str, optional
         Keys of :data:`METHODS`, all by default. EM-MLIRL is given the true number of ways, as in the
         dissertation, or, not told, ``n_components`` of them like MME-MTIRL; both from as many starts as that.
@@ -186,17 +199,21 @@ def sorting_study(
         dissertation.
     n_components : int
         Ways that MME-MTIRL starts from: the most it can find.
+    runs, seed : int
+        Independent repetitions, 3 by default. A smaller number of trajectories is the beginning of a larger
+        one's.
     steps : int
-        Of a trajectory.
+        Of a trajectory, 50 by default.
     belts : int
-        Simulated belts of Table 7.2.
+        Simulated belts of Table 7.2, 300 by default.
 
     Raises
     ------
     ValueError
         For numbers that make no study, saying which.
     """
-    _check(tasks, counts, runs, methods, sessions, n_components, steps, belts)
+    runs, seed, steps, belts = plan = Design(**design)
+    _check(tasks, counts, plan, methods, sessions, n_components)
     sizes = np.array(sorted(set(FEW[tasks] if counts is None else counts)))
     most = int(sizes[-1])
     ends = sizes if sessions is None else np.linspace(0, most, sessions + 1).round().astype(int)[1:]
@@ -252,18 +269,19 @@ def counts_of(tasks: int, text: str | None) -> tuple[int, ...] | None:
 def _check(
     tasks: int,
     counts: Sequence[int] | None,
-    runs: int,
+    design: Design,
     methods: Sequence[str] | None,
     sessions: int | None,
     n_components: int,
-    steps: int,
-    belts: int,
 ) -> None:
     if tasks not in GRID:
         raise ValueError(
             f"tasks must be 2 (pick-inspect-place and roll-pick-place) or 3 (and keep claiming), got {tasks}"
         )
-    for name, number in (("n_components", n_components), ("runs", runs), ("steps", steps), ("belts", belts)):
+    for name, number in (
+        ("n_components", n_components), ("runs", design.runs), ("steps", design.steps),
+        ("belts", design.belts),
+    ):  # fmt: skip
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
     counts = FEW[tasks] if counts is None else counts
