@@ -25,7 +25,7 @@ from ...models.process.layout import Layout, require_layout
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import greedy_actions
 from ..judging.metrics import optimal_actions
-from .style import LIGHT, SMALL, TEXT, Theme, dress, dress_bar, foot, headline, name_ticks, new_figure
+from .style import LIGHT, SMALL, TEXT, Theme, dress, dress_bar, headline, name_ticks, new_figure
 from .text import counted, for_figure
 
 _INCHES_PER_CELL, _SPAN = 0.46, 5.2
@@ -599,7 +599,7 @@ def hidden_path(
     bar = figure.colorbar(image, ax=[strip, axes], pad=0.015, fraction=0.04, aspect=35)
     dress_bar(bar, theme, f"probability of the {place}")
     if left_out:
-        foot(figure, theme, f"left out: {counted(left_out, place)} that never reach {_HARDLY:.0%}")
+        title = f"{title}\nleft out: {counted(left_out, place)} that never reach {_HARDLY:.0%}"
     headline(figure, theme, title, TEXT + 1.5)
     return figure
 

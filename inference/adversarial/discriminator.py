@@ -1,7 +1,7 @@
-"""Discriminators: telling what an expert did from what a generator does, and the reward that follows.
+"""Discriminators of an expert's steps from a generator's, and the rewards that they define.
 
 The objective is that of section 6.2.1 of the dissertation: the expert's transitions are hidden behind noisy
-reports, so ``log D`` is averaged over samples of the truth given the reports.
+observations, so ``log D`` is averaged over draws of the truth given the observations.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from ...models.networks.modules import ActionSpace, Policy, ShapedReward
 
 @shown_briefly
 class Transitions(NamedTuple):
-    """Steps ``(s, a, s')``, and whether the episode ended there for good.
+    """Steps ``(s, a, s')``, and flags of those after which the episode terminated.
 
     Arrays ``[..., d]``, ``[...]`` or ``[..., k]``, ``[..., d]`` and ``[...]``.
     """
@@ -30,19 +30,19 @@ class Transitions(NamedTuple):
     terminated: Array
 
     def rows(self, chosen: Array) -> Transitions:
-        """Those with these indices of the first axis."""
+        """Select rows by their indices on the first axis."""
         return Transitions(*(x[chosen] for x in self))
 
 
 @shown_briefly
 class ExpertTransitions(NamedTuple):
-    """``M`` samples of the truth behind each of ``N`` reported steps.
+    """``M`` draws of the truth behind each of ``N`` observed steps.
 
     Fields
     ------
     steps : Transitions, arrays ``[N, M, ...]``
-    live : bool ``[N]``; False where a row pads
-    weights : float ``[M]``, of the samples, summing to one
+    live : bool ``[N]``; False for padding
+    weights : float ``[M]``, of the draws, summing to one
     """
 
     steps: Transitions
@@ -57,13 +57,14 @@ class Discriminator(NamedTuple):
     Fields
     ------
     name : str
-    init : function of a key, giving the network
-    score : function ``(network, z, a, z', terminated)`` of scaled observations and encoded actions, giving
+    init : function of a key, returning the network
+    score : function ``(network, z, a, z', terminated)`` of scaled observations and encoded actions, returning
         the network's part of the log-odds of "expert"
     offset : function ``(policy, transitions)``, the policy's part of the log-odds
-    rewards : function ``(network, policy, transitions)`` giving what the generator earns, ``[...]``; what it
-        earns for ever after termination is part of the last step's
-    settings : mapping of all that tells it from others of its name, for a journal
+    rewards : function ``(network, policy, transitions)`` returning the generator's reward, ``[...]``; the
+    last
+        step includes the reward after termination
+    settings : mapping of all that distinguishes it from others of its name, for a journal
     """
 
     name: str
@@ -74,7 +75,7 @@ class Discriminator(NamedTuple):
     settings: Mapping[str, Any] = {}
 
     def logits(self, network: ShapedReward, policy: Policy, steps: Transitions) -> Float[Array, "..."]:
-        """Log-odds of "expert", in nats."""
+        """Return the log-odds of "expert", in nats."""
         return self.score(network, *_scaled(network, steps)) + self.offset(policy, steps)
 
 
@@ -93,11 +94,11 @@ def airl_discriminator(
     potential: Sequence[int] = (32, 32),
     state_only: bool = False,
 ) -> Discriminator:
-    """``D = exp f / (exp f + pi)`` with ``f = g + gamma h(s') - h(s)`` (Fu, Luo and Levine 2018).
+    """Build ``D = exp f / (exp f + pi)`` with ``f = g + gamma h(s') - h(s)`` (Fu, Luo and Levine 2018).
 
-    The generator earns ``f - entropy * log pi``: with 1, ``log D - log(1 - D)``, of which its optimum is the
-    soft-optimal policy; with 0, ``f`` alone, as in the released code. Raises ``ValueError`` for a discount
-    that is not below 1, with which what follows termination has no value.
+    The generator earns ``f - entropy * log pi``. With 1 this is ``log D - log(1 - D)``, whose optimum is the
+    soft-optimal policy; with 0 it is ``f`` alone, as in the released code. Raises ``ValueError`` for a
+    discount of 1 or more, for which the value after termination is infinite.
     """
     _require_discount(discount)
 
@@ -139,11 +140,11 @@ def gail_discriminator(
     *,
     hidden: Sequence[int] = (64, 64),
 ) -> Discriminator:
-    """A free classifier of state and action (Ho and Ermon 2016).
+    """Build a free classifier of state and action (Ho and Ermon 2016).
 
-    The generator earns ``log D - log(1 - D)``. Of ``log D`` every step costs something, and of
-    ``-log(1 - D)`` every step pays, so that they teach to end episodes, or to prolong them, whatever the
-    expert does (Kostrikov et al. 2019). Raises as :func:`airl_discriminator`.
+    The generator earns ``log D - log(1 - D)``. With ``log D`` alone every step would cost, and with
+    ``-log(1 - D)`` alone every step would pay; they favour ending or prolonging episodes, whatever the expert
+    does (Kostrikov et al. 2019). Raises as :func:`airl_discriminator`.
     """
     _require_discount(discount)
 
@@ -181,12 +182,12 @@ def _for_ever(reward: Array, discount: float) -> Array:
 
 
 def mean_log_probability(logits: Float[Array, "B M"], weights: Float[Array, " M"]) -> Float[Array, " B"]:
-    """``E[log D]`` over the truth's samples: the expert's part of the objective (section 6.2.1)."""
+    """Average ``log D`` over the draws of the truth: the expert's part of the objective (section 6.2.1)."""
     return jax.nn.log_sigmoid(logits) @ weights
 
 
 def log_probability_of_mean(logits: Float[Array, "B M"], weights: Float[Array, " M"]) -> Float[Array, " B"]:
-    """``log D`` of the mean logit, as in line 13 of Algorithm 3.
+    """Return ``log D`` of the mean logit, as in line 13 of Algorithm 3.
 
     ``log D`` is concave in the logit, so this is at least :func:`mean_log_probability` (Jensen).
     """
@@ -198,7 +199,7 @@ AVERAGES = {"log_probabilities": mean_log_probability, "logits": log_probability
 
 @shown_briefly
 class Losses(NamedTuple):
-    """What one update of the discriminator met: mean cross-entropy (nats), and the share told right."""
+    """Measures of one step of the discriminator: cross-entropy (nats), and the shares classified right."""
 
     loss: Float[Array, ""]
     expert_accuracy: Float[Array, ""]
@@ -215,7 +216,7 @@ def cross_entropy(
     average: str = "log_probabilities",
     importance: ArrayLike = 1.0,
 ) -> tuple[Float[Array, ""], Losses]:
-    """Mean cross-entropy over expert steps ``[B, M]`` and generated steps ``[B]``, in nats per step.
+    """Return the mean cross-entropy over expert steps ``[B, M]`` and generated steps ``[B]``, nats per step.
 
     Steps in the absorbing state count once for each episode that ended. ``importance`` weighs generated steps
     ``[B]`` that were not drawn from the policy alone.
@@ -238,11 +239,11 @@ def gradient_penalty(
     generated: Transitions,
     key: Array,
 ) -> Float[Array, ""]:
-    """Mean of ``(|grad| - 1)^2`` between expert and generated steps (Gulrajani et al. 2017).
+    """Return the mean of ``(|grad| - 1)^2`` between expert and generated steps (Gulrajani et al. 2017).
 
-    Of the network's part of the logit, by scaled observation and encoded action, at points drawn between
-    steps ``[B]`` of the two. It keeps the classifier smooth, so that its reward still points somewhere where
-    the two are easily told apart.
+    The gradient is that of the network's part of the logit, in scaled observation and encoded action, at
+    points drawn between steps ``[B]`` of the two. It keeps the classifier smooth, so that its reward has a
+    slope even where the two sides are easily distinguished.
     """
     share = jax.random.uniform(key, expert.terminated.shape, jnp.float32)[:, None]
     ours, theirs = _scaled(network, expert), _scaled(network, generated)

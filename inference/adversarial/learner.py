@@ -1,11 +1,11 @@
 """Adversarial learners of rewards and policies as networks: AIRL, GAIL and robust-AIRL (chapter 6.2).
 
-One learner with three parts to choose: the discriminator (what the reward is), the generator (who acts, and
-how it improves) and the truth (what the expert did, given the reports). AIRL on clean or noisy input takes
-reports at face value; robust-AIRL (Algorithm 3) samples what is behind them.
+A learner has three parts: the discriminator (the reward), the generator (the policy and its improvement) and
+the truth (the expert's steps, given the observations). AIRL on clean or noisy input takes observations at
+face value; robust-AIRL (Algorithm 3) draws the truth behind them.
 
-Between sessions everything is carried: the reward network, its optimiser and normaliser, the generator with
-its own, generated steps, the sensor and the key. Of demonstrations nothing is (Definition 7).
+A session carries the reward network, its optimiser and normaliser, the generator with its own, generated
+steps, the sensor and the key. It discards the demonstration (Definition 7).
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ else:
 
 @shown_briefly
 class Task(NamedTuple):
-    """What a learner is about where there is no :class:`TabularMDP`: sizes and a name, for its journal."""
+    """Task of a learner without a :class:`TabularMDP`: sizes and a name, for its journal."""
 
     name: str
     observation_size: int
@@ -63,21 +63,21 @@ class Task(NamedTuple):
 
     @property
     def n_actions(self) -> int:
-        """How many actions there are; of vectors, how long they are."""
+        """Number of actions; for vectors, their length."""
         return self.actions.size
 
     def require(self, recording: Recording) -> None:
-        """Raise :class:`~i2rl.models.RecordingError` for a recording of another task, or of none."""
+        """Raise :class:`~i2rl.models.RecordingError` for anything but a recording of this task."""
         require_recording(recording, self.observation_size, self.actions.n, len(self.actions.low))
 
     def fingerprint(self) -> str:
-        """Digest of all fields."""
+        """Digest all fields."""
         return hashlib.sha256(json.dumps(tuple(self)).encode()).hexdigest()
 
 
 @shown_briefly
 class AdversarialState(NamedTuple):
-    """All that is carried from session to session.
+    """State that is carried from session to session.
 
     Fields
     ------
@@ -86,9 +86,9 @@ class AdversarialState(NamedTuple):
     network : ShapedReward
     optimiser : state of the discriminator's optimiser
     generator : state of the generator, with its ``policy``
-    replay : Transitions, generated in the last rounds, ``[K, B, ...]``
-    iterations, pairs : int; rounds of training and reported pairs so far
-    sensor : the truth's
+    replay : Transitions, generated in the latest iterations, ``[K, B, ...]``
+    iterations, pairs : int; iterations of training and observed pairs so far
+    sensor : the truth's sensor
     """
 
     session: Int[Array, ""]
@@ -110,25 +110,25 @@ class AdversarialState(NamedTuple):
 
 @shown_briefly
 class AdversarialInfo(NamedTuple):
-    """What a session did.
+    """Measures of a session.
 
     Fields
     ------
     session : int
     log_likelihood : float
-        Of the expert's actions under the generator's policy, nats a step, averaged over the truth's samples
-        of the session's last round.
+        Log-likelihood of the expert's actions under the generator's policy, nats per step, averaged over the
+        draws of the truth in the session's last iteration.
     loss, expert_accuracy, generated_accuracy : float ``[iterations]``
-        Of the discriminator: cross-entropy in nats, and the shares told right.
+        Measures of the discriminator: cross-entropy in nats, and the shares classified right.
     returns : float ``[iterations]``
-        Mean return, by the environment's own reward, of the episodes that the generator finished; NaN where
-        none ended. Learning never sees it.
+        Mean return, by the environment's own reward, of the episodes that the generator finished; NaN if
+        none ended. Learning does not use it.
     pairs, environment_steps : int
-        Reported pairs, and steps of the generator, in all sessions so far.
+        Observed pairs, and steps of the generator, in all sessions so far.
     iterations : int
-        Rounds of this session.
+        Iterations of this session.
     draws : int ``[k]``
-        Of the truth, in each look at it.
+        Draws of the truth, at each refresh.
     sensor : the truth's sensor after the session
     seconds : float
     weights : float ``[P]``
@@ -150,23 +150,23 @@ class AdversarialInfo(NamedTuple):
 
 
 class AdversarialTraining(NamedTuple):
-    """How a session trains.
+    """Settings of a session's training.
 
     Fields
     ------
     iterations : int, of generator and discriminator, in a session
-    updates : int, of the discriminator in a round
-    batch : int, expert steps (and as many generated ones) an update
+    updates : int, steps of the discriminator in an iteration
+    batch : int, expert steps (and as many generated ones) in a step of the discriminator
     learning_rate : float, of the discriminator's Adam
     average : "log_probabilities" (the objective of section 6.2.1) or "logits" (as released)
     penalty : float, of the gradient (see :func:`gradient_penalty`)
-    replay : int, rounds whose generated steps the discriminator draws from
-    refresh : int, rounds between looks at the truth
-    change : float, nats; infinite for one sampling of the truth a look
-        A look samples on until the average logit of a step moves by no more
+    replay : int, iterations whose generated steps the discriminator draws from
+    refresh : int, iterations between refreshes of the draws of the truth
+    change : float, nats; infinite for one draw of the truth at a refresh
+        A refresh draws until the average logit of a step moves by no more than this
         (:func:`~i2rl.inference.adversarial.truth.look`). The dissertation's ``delta_G`` is a sum over a
         batch: its .1 over 256 steps is 4e-4 here.
-    draws : int, the most in a look
+    draws : int, the most at a refresh
     """
 
     iterations: int = 10
@@ -181,7 +181,7 @@ class AdversarialTraining(NamedTuple):
     draws: int = 20
 
     def checked(self) -> AdversarialTraining:
-        """Itself. Raises ``ValueError`` naming a field that cannot be."""
+        """Validate the settings and return them. Raises ``ValueError`` naming an invalid field."""
         for name in ("iterations", "updates", "batch", "replay", "refresh", "draws"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -203,16 +203,16 @@ def adversarial(
     training: AdversarialTraining | None = None,
     configuration: Mapping[str, Any] | None = None,
 ) -> Learner:
-    """A learner of the session protocol from its parts; its demonstrations are :class:`Recording`.
+    """Build a learner of the session protocol from its parts; its demonstrations are :class:`Recording`.
 
-    ``generator`` is a :class:`PPO`, or has as it does an ``environment``, ``settings``, ``init(key)``,
+    ``generator`` is a :class:`PPO`, or has the same ``environment``, ``settings``, ``init(key)``,
     ``collect(state)`` and ``improve(state, rollout, rewards)``, and states with a ``policy``. ``truth`` is
-    :class:`FaceValue` by default. Recordings of one shape are compiled for once. ``configuration`` adds to
-    what identifies the learner to a journal.
+    :class:`FaceValue` by default. A program is compiled once for each shape of recordings. ``configuration``
+    adds to the configuration that identifies the learner to a journal.
 
     Its ``update`` raises :class:`~i2rl.models.observation.recordings.RecordingError` (a ``ValueError``) for a
-    recording of another task or with numbers that are not finite, naming trajectory and step; the state it
-    was given stays valid.
+    recording of another task or with numbers that are not finite, naming trajectory and step; the given state
+    stays valid.
     """
     environment = generator.environment
     task = Task(environment.name, environment.observation_size, environment.actions)
@@ -296,7 +296,7 @@ def adversarial(
 
 
 def airl(generator: Any, *, training: AdversarialTraining | None = None, **networks: Any) -> Learner:
-    """AIRL that takes reports for the truth; ``networks`` goes to :func:`airl_discriminator`."""
+    """Build AIRL that takes observations for the truth; ``networks`` goes to :func:`airl_discriminator`."""
     task = generator.environment
     networks.setdefault("discount", generator.settings.gamma)
     discriminator = airl_discriminator(task.observation_size, task.actions, **networks)
@@ -304,19 +304,19 @@ def airl(generator: Any, *, training: AdversarialTraining | None = None, **netwo
 
 
 def gail(generator: Any, *, training: AdversarialTraining | None = None, **networks: Any) -> Learner:
-    """GAIL that takes reports for the truth; ``networks`` goes to :func:`gail_discriminator`."""
+    """Build GAIL that takes observations for the truth; ``networks`` goes to :func:`gail_discriminator`."""
     task = generator.environment
     networks.setdefault("discount", generator.settings.gamma)
     discriminator = gail_discriminator(task.observation_size, task.actions, **networks)
     return adversarial("GAIL", generator, discriminator, training=training)
 
 
-# -- a round's parts ------------------------------------------------------------------------------------
+# -- the parts of an iteration ---------------------------------------------------------------------------
 
 
 @jax.jit
 def action_log_likelihood(policy: Policy, expert: ExpertTransitions) -> Float[Array, ""]:
-    """Mean log-likelihood of the expert's actions, nats a step, over the truth's samples."""
+    """Return the mean log-likelihood of the expert's actions, nats per step, over the draws of the truth."""
     each = policy.log_prob(expert.steps.observations, expert.steps.actions) @ expert.weights
     return jnp.sum(jnp.where(expert.live, each, 0)) / jnp.sum(expert.live)
 
@@ -329,7 +329,7 @@ def session_info(
     began: float,
     draws: Sequence[int] = (1,),
 ) -> AdversarialInfo:
-    """What a session did, from the state after it, its last look at the expert, and its rounds' measures."""
+    """Summarise a session from the state after it, its last draws, and its iterations' measures."""
     every: Losses = jax.tree.map(lambda *x: np.asarray(x, np.float64), *losses)
     return AdversarialInfo(
         session=int(state.session),
@@ -347,7 +347,7 @@ def session_info(
 
 
 def identity(generator: Any, discriminator: Discriminator) -> dict[str, Any]:
-    """What tells a journal two learners' parts apart."""
+    """Return the configuration that identifies the parts of a learner to a journal."""
     return {
         "discriminator": discriminator.name,
         "networks": dict(discriminator.settings),
@@ -367,7 +367,7 @@ def _steps(task: Task, rollout: Any) -> Transitions:
 
 
 def blank_steps(task: Task, shape: tuple[int, int]) -> Transitions:
-    """Room for generated steps, ``shape`` of them."""
+    """Allocate room for generated steps, of this ``shape``."""
     d = task.observation_size
     observations = jnp.zeros((*shape, d), DTYPE)
     if task.actions.discrete:
@@ -379,14 +379,14 @@ def blank_steps(task: Task, shape: tuple[int, int]) -> Transitions:
 
 @jax.jit
 def remembered(replay: Transitions, new: Transitions, place: int) -> Transitions:
-    """Generated steps with those of one round in the place of another's."""
+    """Replace one iteration's generated steps by those of another."""
     return Transitions(
         *(old.at[place].set(x.reshape(old.shape[1:])) for old, x in zip(replay, new, strict=True))
     )
 
 
 def discriminator_objective(discriminator: Discriminator, how: AdversarialTraining) -> Objective:
-    """Cross-entropy, averaged and penalised as the training says."""
+    """Build the cross-entropy, averaged and penalised by the training's settings."""
 
     def objective(
         network: ShapedReward,

@@ -1,16 +1,16 @@
-"""Noisy-AIRL: AIRL that also sees what becomes of its policy when actions are random (Chen et al. 2020).
+"""Noisy-AIRL: AIRL whose generator also acts with random actions (Chen et al. 2020).
 
 The first step of robust-AIRL's baseline, :mod:`~i2rl.inference.adversarial.self_supervised` (section 7.3).
-The generator acts side by side in environments that put random actions in place of its own, each with a
-probability of its own, so that the discriminator meets worse behaviour than the generator's and learns a
-reward that holds beyond what the expert visits. That the generated actions do not all come from the policy is
-made up for by importance weights.
+The generator acts side by side in environments that replace its actions by random ones, each with its own
+probability. The discriminator thereby sees worse behaviour than the generator's and learns a reward that
+holds beyond the states of the expert. Importance weights correct for the generated actions that do not come
+from the policy.
 
-Each step has two actions: the one *intended*, drawn from the policy, and the one *executed*. A rollout holds
-the intended ones, so its log-probabilities are those of the policy and PPO improves on-policy. The
-discriminator is shown either (``shown``). The released code shows it the intended action, and weighs that;
-then action and successor do not belong together, which a reward of states alone does not notice. Weights of
-the executed action are what the mixture asks for: ``E_executed[w g] = E_policy[g]`` at each state.
+Each step has two actions: the *intended* one, drawn from the policy, and the *executed* one. A rollout holds
+the intended actions, so its log-probabilities are those of the policy and PPO improves on-policy. The
+discriminator sees one of them (``shown``). The released code uses the intended action and its weight; action
+and successor then do not match, which a reward of states alone does not notice. The weights of the executed
+action are the correct ones for the mixture: ``E_executed[w g] = E_policy[g]`` at each state.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ else:
     optax = required("optax")
 
 LEVELS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.05, 0.10, 0.15, 0.20, 0.25)
-"""Probabilities of a random action in the ten environments that the generator acts in, as released."""
+"""Probabilities of a random action in the generator's ten environments, as released."""
 
 SHOWN = ("intended", "executed")
 
@@ -63,7 +63,7 @@ SHOWN = ("intended", "executed")
 
 
 def log_uniform(actions: ActionSpace, chosen: ArrayLike) -> Float[Array, "..."]:
-    """Log-density of an action if any is as likely as any other: minus infinity beyond the bounds."""
+    """Return the log-density of a uniformly random action: minus infinity beyond the bounds."""
     chosen = jnp.asarray(chosen)
     if actions.discrete:
         return jnp.full(chosen.shape, -np.log(actions.n), DTYPE)
@@ -75,9 +75,9 @@ def log_uniform(actions: ActionSpace, chosen: ArrayLike) -> Float[Array, "..."]:
 def importance_weights(
     policy: Policy, observations: Float[Array, "... d"], chosen: Array, levels: Float[Array, "..."]
 ) -> Float[Array, "..."]:
-    """``pi(a|s) / (eps u(a) + (1 - eps) pi(a|s))``: what an action counts where ``eps`` of them are random.
+    """Return ``pi(a|s) / (eps u(a) + (1 - eps) pi(a|s))``, the weight of an action if ``eps`` are random.
 
-    ``u`` is uniform over the actions. At most ``1 / (1 - eps)``, and 1 without noise.
+    ``u`` is uniform over the actions. The weight is at most ``1 / (1 - eps)``, and 1 without noise.
     """
     log_pi = policy.log_prob(observations, chosen)
     levels = jnp.asarray(levels, DTYPE)
@@ -88,7 +88,7 @@ def importance_weights(
 def _random_actions(
     key: Array, actions: ActionSpace, levels: Float[Array, " n"], length: int
 ) -> tuple[Array, Array]:
-    """For ``length`` steps whether each action is replaced, ``[length, n]``, and by what."""
+    """Draw replacements for ``length`` steps: flags ``[length, n]`` and random actions."""
     k_whether, k_what = jax.random.split(key)
     shape = (length, levels.shape[0])
     replaced = jax.random.uniform(k_whether, shape, DTYPE) < levels
@@ -108,19 +108,19 @@ def _replace(replaced: Any, random: Any, intended: Any) -> Any:
 
 @shown_briefly
 class NoisyRollout(NamedTuple):
-    """What an agent did while some of its actions were replaced.
+    """Rollout in which some actions were replaced.
 
     Fields
     ------
-    rollout : Rollout, its actions those intended
-    executed : int32 ``[T, n]`` or float32 ``[T, n, k]``, the actions taken
+    rollout : Rollout, with the intended actions
+    executed : int32 ``[T, n]`` or float32 ``[T, n, k]``, the executed actions
     """
 
     rollout: Rollout
     executed: Array
 
     def steps(self, shown: str) -> Transitions:
-        """Transitions ``[T, n, ...]`` with the ``intended`` or the ``executed`` actions, as drawn."""
+        """Return transitions ``[T, n, ...]`` with the ``intended`` or the ``executed`` actions, as drawn."""
         chosen = self.executed if shown == "executed" else self.rollout.actions
         return Transitions(
             self.rollout.observations, chosen, self.rollout.next_observations, self.rollout.terminated
@@ -136,9 +136,9 @@ def roll_out_noisily(
     key: Array,
     length: int,
 ) -> tuple[Running, NoisyRollout]:
-    """``length`` steps of every episode, actions being random with probability ``levels[i]`` in the ``i``-th.
+    """Roll out ``length`` steps of every episode, with random actions in the ``i``-th at rate ``levels[i]``.
 
-    As :func:`~i2rl.inference.adversarial.rollouts.roll_out`, new episodes beginning where old ones end. Noise
+    New episodes begin where old ones end, as in :func:`~i2rl.inference.adversarial.rollouts.roll_out`. Noise
     is drawn before the first step.
     """
     levels = jnp.asarray(levels, DTYPE)
@@ -156,7 +156,7 @@ _random_on_host = jax.jit(_random_actions, static_argnums=(1, 3))
 
 
 class _Disturbed:
-    """A task on the host in one rollout: its steps taken one after another, some with other actions."""
+    """A task on the host in one rollout: its steps in sequence, some with replaced actions."""
 
     def __init__(self, environment: HostEnvironment, replaced: np.ndarray, random: np.ndarray) -> None:
         self.name, self.observation_size = environment.name, environment.observation_size
@@ -165,7 +165,7 @@ class _Disturbed:
         self._step, self._noise = environment.step, zip(replaced, random, strict=True)
 
     def step(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """The task's own step after what is executed."""
+        """Step the task with the executed actions."""
         return self._step(states, _replace(*next(self._noise), actions))
 
 
@@ -214,17 +214,18 @@ def _compiled(
 
 
 class NoisyTraining(NamedTuple):
-    """How a session trains.
+    """Settings of a session's training.
 
     Fields
     ------
     iterations : int, of generator and discriminator, in a session
-    updates : int, of the discriminator in a round
-    batch : int, expert steps (and as many generated ones) an update
+    updates : int, steps of the discriminator in an iteration
+    batch : int, expert steps (and as many generated ones) in a step of the discriminator
     learning_rate : float, of the discriminator's Adam
     replay : int
-        Rounds whose generated steps the discriminator draws from. Their probabilities are those under the
-        policy of the moment, not under that of their time as released, for which the log-odds are wrong.
+        Iterations whose generated steps the discriminator draws from. Their probabilities are those under
+        the current policy. The released code uses the policy of their time, for which the log-odds are
+        wrong.
     levels : probabilities of a random action, dealt out to the environments in turn
     shown : "intended" (as released) or "executed", the action that the discriminator sees and weighs
     """
@@ -238,7 +239,7 @@ class NoisyTraining(NamedTuple):
     shown: str = "intended"
 
     def checked(self, environments: int) -> NoisyTraining:
-        """Itself. Raises ``ValueError`` naming a field that cannot be."""
+        """Validate the settings and return them. Raises ``ValueError`` naming an invalid field."""
         for name in ("iterations", "updates", "batch", "replay"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -260,13 +261,13 @@ def noisy_airl(
     training: NoisyTraining | None = None,
     configuration: Mapping[str, Any] | None = None,
 ) -> Learner:
-    """Noisy-AIRL as a learner of the session protocol; its demonstrations are :class:`Recording`.
+    """Build noisy-AIRL as a learner of the session protocol; its demonstrations are :class:`Recording`.
 
-    State and report are those of :func:`~i2rl.inference.adversarial.learner.adversarial`, all of it carried.
+    State and info are those of :func:`~i2rl.inference.adversarial.learner.adversarial`, all carried.
     ``discriminator`` is :func:`~i2rl.inference.adversarial.discriminator.airl_discriminator`, with
-    ``state_only=True`` for the method as published (whose discount is 1; here it must be below, for what
-    follows termination to have a value). ``agent`` has as many environments as there are noise levels, or a
-    multiple. ``configuration`` adds to what identifies the learner to a journal.
+    ``state_only=True`` for the published method (whose discount is 1; here it must be below 1, so that the
+    value after termination is finite). ``agent`` has as many environments as there are noise levels, or a
+    multiple. ``configuration`` adds to the configuration that identifies the learner to a journal.
     """
     environment, settings = agent.environment, agent.settings
     n, size = settings.n_envs, settings.steps
@@ -357,7 +358,7 @@ def _objective(discriminator: Discriminator, levels: Float[Array, " n"]) -> Obje
         places: Array,
         key: Array,
     ) -> tuple[Float[Array, ""], Losses]:
-        # A stored step's place is (round * T + step) * n + environment.
+        # A stored step's place is (iteration * T + step) * n + environment.
         at = levels[places % levels.shape[0]]
         # Weights are of the action as drawn: beyond the bounds it cannot have been a random one.
         importance = importance_weights(policy, generated.observations, generated.actions, at)

@@ -1,6 +1,6 @@
-"""Proximal policy optimisation (Schulman et al. 2017): the generator where no planner is exact.
+"""Proximal policy optimisation (Schulman et al. 2017): the generator for tasks without an exact planner.
 
-Three functions on one state, apart so that a learner can put its own reward between acting and learning::
+Three functions on one state, separate so that a learner can insert its own reward before the improvement::
 
     agent = ppo(environment)
     state = agent.init(key)
@@ -9,9 +9,9 @@ Three functions on one state, apart so that a learner can put its own reward bet
 
 With a compiled :class:`Environment` all three can be part of a larger compiled program.
 
-What ends an episode matters to what is learned. Where only the time ran out, the value of the true successor
-is counted; where the task terminated, nothing is. A reward of what follows termination (the absorbing state)
-is for the caller to add to the reward of the last step.
+The end of an episode enters the advantages. If only the time ran out, the value of the true successor counts;
+if the task terminated, it does not. The caller adds a reward after termination (the absorbing state) to the
+reward of the last step.
 """
 
 from __future__ import annotations
@@ -43,23 +43,23 @@ else:
 
 
 class Settings(NamedTuple):
-    """How an agent learns; the defaults are those of Stable-Baselines3, observations being scaled.
+    """Settings of an agent; the defaults are those of Stable-Baselines3, with scaled observations.
 
     Fields
     ------
     n_envs, n_steps : int, episodes side by side, and steps of each between improvements
     gamma, gae_lambda : float, the discount, and the weight of longer estimates of the advantage
-    clip : float, how far the ratio of new to old probabilities counts
+    clip : float, range of the ratio of new to old probabilities that counts
     epochs, minibatch : int, passes over a rollout, and steps in each gradient
     learning_rate : float, of Adam
-    decay_over : int, environment steps over which the rate falls linearly to zero; 0 keeps it
+    decay_over : int, environment steps over which the rate falls linearly to zero; 0 for a constant rate
     entropy, value_coefficient, max_grad_norm : float
     hidden : layers of the policy and of the critic
-    log_deviation : float, of continuous actions at first
-    scale_observations : whether networks see observations in deviations from their mean so far
-    scale_rewards : whether rewards are divided by the deviation of discounted returns so far, and cut off at
-        ten: for rewards of unknown size, and where large values of the critic would crowd out the policy
-    reward_memory : float, steps that this deviation remembers; fewer where the reward itself is learned
+    log_deviation : float, initial value for continuous actions
+    scale_observations : True if networks see observations in deviations from their mean so far
+    scale_rewards : True to divide rewards by the deviation of discounted returns so far, and clip them at
+        ten: for rewards of unknown size, or if large values of the critic would dominate the policy
+    reward_memory : float, number of steps that this deviation averages; lower for a reward that is learned
     """
 
     n_envs: int = 8
@@ -88,12 +88,12 @@ class Settings(NamedTuple):
 
 @shown_briefly
 class ReturnScale(NamedTuple):
-    """The spread of discounted returns so far.
+    """Spread of discounted returns so far.
 
     Fields
     ------
-    returns : float32 ``[n]``, of the episodes under way, the latest reward last
-    norm : RunningNorm, of these
+    returns : float32 ``[n]``, of the current episodes, the latest reward last
+    norm : RunningNorm, of these returns
     """
 
     returns: Float[Array, " n"]
@@ -102,14 +102,14 @@ class ReturnScale(NamedTuple):
 
 @shown_briefly
 class PPOState(NamedTuple):
-    """An agent in the middle of its episodes: all that is needed to go on.
+    """State of an agent in the middle of its episodes, sufficient to continue.
 
     Fields
     ------
     policy : the policy network, with the norm of observations
     critic : MLP from a scaled observation to its value
     optimiser : Adam's, of all weights in one vector
-    running : the episodes under way
+    running : the current episodes
     scale : ReturnScale
     updates : int32, improvements so far
     key : random key
@@ -126,13 +126,13 @@ class PPOState(NamedTuple):
 
 @shown_briefly
 class Training(NamedTuple):
-    """How training went, one entry for each rollout.
+    """Progress of training, one entry for each rollout.
 
     Fields
     ------
     steps : int ``[U]``, environment steps so far
-    returns : float ``[U]``, mean return of the episodes that ended in it; NaN where none did
-    episodes : int ``[U]``, how many did
+    returns : float ``[U]``, mean return of the episodes that ended in it; NaN if none did
+    episodes : int ``[U]``, number of these episodes
     """
 
     steps: Int[np.ndarray, " U"]
@@ -147,7 +147,7 @@ class PPO(NamedTuple):
     Fields
     ------
     init : ``(key) -> PPOState``
-    collect : ``(state) -> (state, Rollout)``, with the policy as it is
+    collect : ``(state) -> (state, Rollout)``, with the current policy
     improve : ``(state, rollout, rewards [T, n]) -> state``
     train : ``(state, steps) -> (state, Training)``, at least that many steps by the environment's reward
     evaluate : ``(policy, key, episodes, deterministic=True) -> Episodes``
@@ -163,10 +163,10 @@ class PPO(NamedTuple):
 
 
 def ppo(environment: Task, **settings: Any) -> PPO:
-    """An agent for a task, by the :class:`Settings` given by name.
+    """Build an agent for a task from the :class:`Settings` given by name.
 
-    Scaled observations help where their coordinates differ in size, as a robot's do; the cart-pole, which
-    they hinder, is learned in 25,000 steps with ``learning_rate=1e-3``, ``scale_observations=False`` and
+    Scaled observations help if their coordinates differ in size, as a robot's do. They hinder the cart-pole,
+    which is learned in 25,000 steps with ``learning_rate=1e-3``, ``scale_observations=False`` and
     ``scale_rewards=True``. Raises ``ValueError`` for a setting out of its range.
     """
     chosen = _checked(Settings(**settings))
@@ -194,7 +194,7 @@ def advantages(
     gamma: float,
     gae_lambda: float,
 ) -> Float[Array, "T n"]:
-    """Generalised advantage estimates (Schulman et al. 2016, Eq. 16).
+    """Return generalised advantage estimates (Schulman et al. 2016, Eq. 16).
 
     ``A_t = sum_l (gamma lambda)^l (r_{t+l} + gamma V(s_{t+l+1}) - V(s_{t+l}))``, up to the end of the episode
     or of the rollout. ``next_values`` are of the true successors; those of terminated steps do not count.
@@ -212,7 +212,7 @@ def advantages(
 
 @shown_briefly
 class Sample(NamedTuple):
-    """What a gradient is taken of: steps of a rollout with their estimates, ``[m, ...]``."""
+    """Minibatch of a gradient: steps of a rollout with their estimates, ``[m, ...]``."""
 
     observations: Float[Array, "m d"]
     actions: Array
@@ -222,7 +222,7 @@ class Sample(NamedTuple):
 
 
 def loss(policy: Policy, critic: MLP, sample: Sample, settings: Settings) -> Float[Array, ""]:
-    """The clipped objective (Schulman et al. 2017, Eq. 9) to be made small, advantages scaled here."""
+    """Compute the clipped objective (Schulman et al. 2017, Eq. 9), negated, with scaled advantages."""
     weight = sample.advantages
     weight = (weight - weight.mean()) / (weight.std() + 1e-8)
     ratio = jnp.exp(policy.log_prob(sample.observations, sample.actions) - sample.log_probs)
@@ -268,14 +268,14 @@ _roll_compiled = jax.jit(_roll, static_argnums=(0, 1))
 
 
 def _improve_with(settings: Settings, state: PPOState, rollout: Rollout, rewards: ArrayLike) -> PPOState:
-    """One improvement: advantages, then epochs of minibatches, then the norm of observations."""
+    """Improve once: advantages, then epochs of minibatches, then the norm of observations."""
     expected = (settings.n_steps, settings.n_envs)
     if np.shape(rewards) != expected or rollout.rewards.shape != expected:
         raise ValueError(
             f"an agent of {settings.n_steps} steps in {settings.n_envs} environments improves by rewards of "
             f"shape {expected}; got {np.shape(rewards)} for a rollout of {rollout.rewards.shape}"
         )
-    # The host's episodes stay on the host, to the bit.
+    # The host's episodes stay on the host, bit by bit.
     improved = _improve(settings, state._replace(running=None), rollout, rewards)  # type: ignore[arg-type]
     return improved._replace(running=state.running)
 
@@ -306,7 +306,7 @@ def _improve(settings: Settings, state: PPOState, rollout: Rollout, rewards: Arr
     key, k_order = jax.random.split(state.key)
     policy, critic, optimiser = _descend(settings, state, sample, k_order)
     if settings.scale_observations:
-        # Only now: the ratios above are of probabilities under the norm that the actions were drawn with.
+        # Last: the ratios above use probabilities under the norm with which the actions were drawn.
         policy = eqx.tree_at(lambda p: p.norm, policy, policy.norm.update(rollout.observations))
     return state._replace(
         policy=policy, critic=critic, optimiser=optimiser, scale=scale, updates=state.updates + 1, key=key
@@ -314,7 +314,7 @@ def _improve(settings: Settings, state: PPOState, rollout: Rollout, rewards: Arr
 
 
 def _descend(settings: Settings, state: PPOState, sample: Sample, key: Array) -> tuple[Policy, MLP, Any]:
-    """Adam over all minibatches of all epochs, on all weights in one vector."""
+    """Run Adam over all minibatches of all epochs, on all weights in one vector."""
     flat, unravel = ravel_pytree(_weights(state.policy, state.critic))
     adam = _adam(settings)
     rate = jnp.asarray(settings.learning_rate, DTYPE)
@@ -352,11 +352,11 @@ def _train(environment: Task, settings: Settings, state: PPOState, steps: int) -
     return state, Training(rounds * settings.steps, np.array(means, float), np.array(counts, int))
 
 
-# -- parts of these -----------------------------------------------------------------------------------
+# -- parts of the functions -----------------------------------------------------------------------------
 
 
 def _weights(policy: Policy, critic: MLP) -> tuple[Policy, MLP]:
-    """The networks without the norm of observations, which is not learned by gradients."""
+    """Return the networks without the norm of observations, which is not learned by gradients."""
     return eqx.tree_at(lambda p: p.norm, policy, None), critic
 
 

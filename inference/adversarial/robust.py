@@ -1,15 +1,15 @@
-"""robust-AIRL for continuous tasks (section 6.2, Algorithm 3): the truth behind reports, under the policy.
+"""robust-AIRL for continuous tasks (section 6.2, Algorithm 3): draws of the truth under the policy.
 
-What is done about noise is one object, the learner's :class:`~i2rl.inference.adversarial.learner.Truth`:
+One object handles the noise, the learner's :class:`~i2rl.inference.adversarial.learner.Truth`:
 
 :class:`Smoothed`
-    the sensor is known, as the dissertation has it;
+    the sensor is known, as in the dissertation;
 :class:`SmoothedAndFitted`
-    only its form is, and its parameters are fitted to each session by expectation-maximisation.
+    only the sensor's form is known; its parameters are fitted to each session by expectation-maximisation.
 
-Either way the truth is found under the generator's policy of the moment, every few rounds (``refresh`` of
-:class:`~i2rl.inference.adversarial.learner.AdversarialTraining`), and the chain goes on from where the last
-look at the session's reports left it.
+Both draw the truth under the generator's current policy, every few iterations (``refresh`` of
+:class:`~i2rl.inference.adversarial.learner.AdversarialTraining`); the chain continues from the session's
+previous refresh.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from .learner import AdversarialTraining, adversarial
 
 @shown_briefly
 class Look(NamedTuple):
-    """The chain, and the policy it was last looked at under (None before the first look)."""
+    """The chain, and the policy of its last refresh (None before the first)."""
 
     chain: Any
     policy: Policy | None
@@ -49,14 +49,15 @@ class Look(NamedTuple):
 
 @shown_briefly
 class Smoothed(NamedTuple):
-    """The truth by smoothing, the sensor being known.
+    """The truth by smoothing, with a known sensor.
 
     Fields
     ------
     truth : GaussianTruth, GaussianGibbs, CandidateTruth or PartitionTruth, with the dynamics
-    sensor : the sensor it is about
+    sensor : the sensor assumed
     passes : int
-        Relinearisations of the first look at a recording; later looks, which go on from it, make one.
+        Relinearisations at the first refresh of a recording; later refreshes, which continue from it, make
+        one.
     """
 
     truth: Any
@@ -64,15 +65,15 @@ class Smoothed(NamedTuple):
     passes: int = 6
 
     def prior(self) -> Any:
-        """The sensor."""
+        """Return the sensor."""
         return self.sensor
 
     def begin(self, recording: Recording, sensor: Any, key: Array) -> Look:
-        """Start at the reports. Raises ``ValueError`` where their sizes are not the dynamics'."""
+        """Start at the observations. Raises ``ValueError`` if their sizes differ from the dynamics'."""
         return Look(self.truth.init(recording, sensor), None)
 
     def refresh(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
-        """Relinearise where there is something to, smooth, and draw under the policy."""
+        """Relinearise nonlinear dynamics, smooth, and draw under the policy."""
         passes = (
             (self.passes if chain.policy is None else 1,) if isinstance(self.truth, GaussianTruth) else ()
         )
@@ -80,26 +81,26 @@ class Smoothed(NamedTuple):
         return Look(found, policy), as_expert(drawn)
 
     def more(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
-        """Draw again; where the dynamics were linearised, they stay so."""
+        """Draw again without a new linearisation."""
         if isinstance(self.truth, GaussianTruth):
             return chain, as_expert(self.truth.resample(chain.chain, policy, key, sensor))
         return self.refresh(chain, sensor, policy, key)
 
     def learned(self, chain: Look, sensor: Any) -> Any:
-        """The sensor as it was."""
+        """Return the sensor unchanged."""
         return sensor
 
 
 @shown_briefly
 class SmoothedAndFitted(NamedTuple):
-    """The truth by smoothing, the sensor being fitted in every session.
+    """The truth by smoothing, with a sensor that is fitted in every session.
 
     Fields
     ------
-    truth, passes : as of :class:`Smoothed`
-    sensor : what is believed before the first session
+    truth, passes : as in :class:`Smoothed`
+    sensor : the assumption before the first session
     fit : ``(truth, chain, policy, sensor) -> sensor``, one step of expectation-maximisation
-    steps : int, of it a session
+    steps : int, number of these steps in a session
     """
 
     truth: Any
@@ -109,23 +110,23 @@ class SmoothedAndFitted(NamedTuple):
     steps: int = 10
 
     def prior(self) -> Any:
-        """What is believed of the sensor before the first session."""
+        """Return the assumed sensor before the first session."""
         return self.sensor
 
     def begin(self, recording: Recording, sensor: Any, key: Array) -> Look:
-        """As :meth:`Smoothed.begin`."""
+        """Start as :meth:`Smoothed.begin` does."""
         return Smoothed(self.truth, sensor, self.passes).begin(recording, sensor, key)
 
     def refresh(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
-        """As :meth:`Smoothed.refresh`."""
+        """Refresh as :meth:`Smoothed.refresh` does."""
         return Smoothed(self.truth, sensor, self.passes).refresh(chain, sensor, policy, key)
 
     def more(self, chain: Look, sensor: Any, policy: Policy, key: Array) -> tuple[Look, ExpertTransitions]:
-        """As :meth:`Smoothed.more`."""
+        """Draw again as :meth:`Smoothed.more` does."""
         return Smoothed(self.truth, sensor, self.passes).more(chain, sensor, policy, key)
 
     def learned(self, chain: Look, sensor: Any) -> Any:
-        """The sensor under which the session's reports are likeliest."""
+        """Fit the sensor to the session's observations by maximum likelihood."""
         assert chain.policy is not None
         for _ in range(self.steps):
             sensor = self.fit(self.truth, chain.chain, chain.policy, sensor)
@@ -133,15 +134,15 @@ class SmoothedAndFitted(NamedTuple):
 
 
 def fit_gaussian(truth: GaussianTruth, chain: Any, policy: Policy, sensor: GaussianSensor) -> GaussianSensor:
-    """Diagonal covariances, with the dynamics as last linearised (closed form)."""
+    """Fit diagonal covariances, with the dynamics as last linearised (closed form)."""
     return fitted_sensor(chain.reported, truth.posterior(chain, policy, sensor))
 
 
 def fit_isotropic(truth: GaussianTruth, chain: Any, policy: Policy, sensor: GaussianSensor) -> GaussianSensor:
-    """One covariance for all components of states and actions alike (closed form).
+    """Fit one variance for all coordinates of states and actions (closed form).
 
-    What the dynamics say little of, such as the velocities of limbs that strike the ground, could not be told
-    from noise by itself: :func:`fit_gaussian` leaves such components as they were believed to be.
+    Coordinates that the dynamics hardly determine, such as the velocities of limbs that strike the ground,
+    cannot be distinguished from noise alone: :func:`fit_gaussian` leaves them at their assumed values.
     """
     each = fit_gaussian(truth, chain, policy, sensor)
     common = jnp.mean(jnp.concatenate([jnp.diagonal(x) for x in each]))
@@ -149,13 +150,13 @@ def fit_isotropic(truth: GaussianTruth, chain: Any, policy: Policy, sensor: Gaus
 
 
 def fit_shift(truth: CandidateTruth, chain: Any, policy: Policy, sensor: ShiftSensor) -> ShiftSensor:
-    """The probability of a shift (closed form)."""
+    """Fit the probability of a shift (closed form)."""
     return fitted_shift_sensor(sensor, chain, truth.posterior(chain, policy, sensor))
 
 
 @jax.jit
 def as_expert(drawn: Truths) -> ExpertTransitions:
-    """Draws ``[M, n, L]`` as the samples of ``n L`` expert steps."""
+    """Arrange draws ``[M, n, L]`` as the draws of ``n L`` expert steps."""
 
     def rows(x: Array) -> Array:
         return jnp.moveaxis(x.reshape(x.shape[0], -1, *x.shape[3:]), 0, 1)
@@ -175,21 +176,21 @@ def robust_airl(
     discriminator: Discriminator | None = None,
     training: AdversarialTraining | None = None,
 ) -> Learner:
-    """robust-AIRL with a known sensor.
+    """Build robust-AIRL with a known sensor.
 
     Parameters
     ----------
     generator : PPO, or as :func:`~i2rl.inference.adversarial.learner.adversarial` takes it
     truth : GaussianTruth, GaussianGibbs, CandidateTruth or PartitionTruth
         With the dynamics: ``gaussian_truth(robot, robot.observation_size)``, say.
-    sensor : the sensor behind the reports, such as :class:`GaussianSensor`
+    sensor : the sensor behind the observations, such as :class:`GaussianSensor`
     discriminator, training : by default AIRL's, and :class:`AdversarialTraining`'s own
 
     Raises
     ------
     ValueError
-        For a sensor that cannot be: a covariance of another size or not positive definite, a probability
-        outside [0, 1].
+        For an invalid sensor: a covariance of another size or not positive definite, a probability outside
+        [0, 1].
     """
     return _learner("robust-AIRL", generator, Smoothed(truth, sensor), discriminator, training)
 
@@ -203,7 +204,7 @@ def robust_airl_with_sensor(
     discriminator: Discriminator | None = None,
     training: AdversarialTraining | None = None,
 ) -> Learner:
-    """robust-AIRL that learns the sensor's parameters too, from ``sensor`` on; else :func:`robust_airl`."""
+    """Build robust-AIRL that also learns the sensor's parameters, starting from ``sensor``."""
     hidden = SmoothedAndFitted(truth, sensor, fit)
     return _learner("robust-AIRL with sensor", generator, hidden, discriminator, training)
 
@@ -233,7 +234,7 @@ def _learner(
 
 
 def _carried(sensor: Any, environment: Any) -> Any:
-    """A sensor as arrays of the shapes that a fitted one has too."""
+    """Convert a sensor to arrays of the shapes that a fitted one also has."""
     require_continuous(sensor)
     if isinstance(sensor, GaussianSensor):
         return sensor.sized(environment.observation_size, environment.actions.size)
@@ -241,7 +242,7 @@ def _carried(sensor: Any, environment: Any) -> Any:
 
 
 def _digest(truth: Any) -> str:
-    """Identifies what is assumed of the truth, but for the dynamics, which are functions."""
+    """Digest the assumptions on the truth, except the dynamics, which are functions."""
     digest = hashlib.sha256()
     for path, leaf in jax.tree_util.tree_leaves_with_path(truth):
         if not any(getattr(part, "name", None) == "dynamics" for part in path):

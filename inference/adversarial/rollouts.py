@@ -1,8 +1,8 @@
-"""Behaviour of a policy in a task: rollouts to learn from, and whole episodes to judge by.
+"""Behaviour of a policy in a task: rollouts for learning, and whole episodes for evaluation.
 
-Compiled tasks are rolled out in one scan. Tasks in NumPy are stepped from the host, the network's arrays
-being multiplied by NumPy too: for a few rows that takes a fifth of the time of dispatching a compiled
-program. Either way all noise is drawn from the key before the first step.
+Compiled tasks are rolled out in one scan. Tasks in NumPy are stepped from the host, and the network is
+evaluated in NumPy too: for a few rows this takes a fifth of the time of dispatching a compiled program. In
+both cases all noise is drawn from the key before the first step.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ _SPARE_STARTS = 32
 
 @shown_briefly
 class Running(NamedTuple):
-    """Episodes under way, side by side.
+    """Current episodes, side by side.
 
     Fields
     ------
     states : ``[n, D]``, the environment's
-    steps : int32 ``[n]``, how many each has lasted
-    returns : float32 ``[n]``, what each has earned, by the environment's reward
+    steps : int32 ``[n]``, length of each so far
+    returns : float32 ``[n]``, return of each so far, by the environment's reward
     """
 
     states: Array
@@ -48,11 +48,11 @@ class Episodes(NamedTuple):
 
     Fields
     ------
-    observations : float32 ``[n, T + 1, d]``, the one after the last step included
+    observations : float32 ``[n, T + 1, d]``, with the one after the last step
     actions : int32 ``[n, T]`` or float32 ``[n, T, k]``
     rewards : float32 ``[n, T]``, zero after the end
-    lengths : int ``[n]``, steps; what follows them in the arrays means nothing
-    terminated : bool ``[n]``, whether the task ended; otherwise the time ran out
+    lengths : int ``[n]``, steps; later entries of the arrays are meaningless
+    terminated : bool ``[n]``, True if the task ended, False if the time ran out
     """
 
     observations: Float[np.ndarray, "n T+1 d"]
@@ -68,7 +68,7 @@ class Episodes(NamedTuple):
 
 
 def begin(environment: Task, key: Array, n: int) -> Running:
-    """``n`` episodes at their first states."""
+    """Begin ``n`` episodes at their first states."""
     if isinstance(environment, Environment):
         states = jax.vmap(environment.reset)(jax.random.split(key, n))
         return Running(states, jnp.zeros(n, jnp.int32), jnp.zeros(n, DTYPE))
@@ -82,7 +82,7 @@ def begin(environment: Task, key: Array, n: int) -> Running:
 def roll_out(
     environment: Task, policy: Policy, critic: MLP, running: Running, key: Array, length: int
 ) -> tuple[Running, Rollout]:
-    """``length`` steps of every episode, new ones beginning where old ones end.
+    """Roll out ``length`` steps of every episode; new ones begin where old ones end.
 
     With a compiled environment this is a pure function that can be part of a larger program.
     """
@@ -92,14 +92,14 @@ def roll_out(
 
 
 def play(environment: Task, policy: Policy, key: Array, n: int, *, deterministic: bool = False) -> Episodes:
-    """``n`` whole episodes; ``deterministic`` takes the policy's mode instead of drawing."""
+    """Play ``n`` whole episodes; ``deterministic`` takes the policy's mode instead of a draw."""
     if isinstance(environment, Environment):
         return Episodes(*map(np.asarray, _play_compiled(environment, policy, key, n, deterministic)))
     return _play_on_host(environment, policy, key, n, deterministic)
 
 
 def finished_returns(before: Running, rollout: Rollout) -> Float[np.ndarray, " episodes"]:
-    """Returns of the episodes that ended in a rollout, which set out from ``before``."""
+    """Return the returns of the episodes that ended in a rollout, which began at ``before``."""
     rewards = np.asarray(rollout.rewards)
     done = np.asarray(rollout.terminated | rollout.truncated)
     returns, sums = [], np.array(before.returns)
@@ -120,14 +120,14 @@ def _noise(policy: Policy, key: Array, shape: tuple[int, ...]) -> Array:
 
 
 def _act(policy: Policy, observations: Array, noise: Array) -> Array:
-    """Actions with the policy's law, as a function of standard noise."""
+    """Draw actions from the policy as a function of standard noise."""
     if isinstance(policy, CategoricalPolicy):
         return jnp.argmax(policy.log_probs(observations) + noise, -1).astype(jnp.int32)
     return policy.mode(observations) + jnp.exp(policy.log_deviation) * noise
 
 
 def _host_actor(policy: Policy) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """:func:`_act` in NumPy."""
+    """Build :func:`_act` in NumPy."""
     mean, deviation = np.asarray(policy.norm.mean), np.asarray(policy.norm.deviation)
     if isinstance(policy, GaussianPolicy):
         network, spread = _host_network(policy.mean), np.exp(np.asarray(policy.log_deviation))
@@ -286,7 +286,7 @@ def _no_actions(policy: Policy, *shape: int) -> np.ndarray:
 
 
 def _starts(environment: HostEnvironment, key: Array) -> Iterator[np.ndarray]:
-    """First states one after another, drawn some at a time."""
+    """Yield first states, drawn some at a time."""
     for i in count():
         yield from environment.reset(jax.random.fold_in(key, i), _SPARE_STARTS)
 
@@ -304,7 +304,7 @@ def _judged(
     terminated: Array,
     truncated: Array,
 ) -> Rollout:
-    """What was recorded, with the log-probabilities and the values of all steps at once."""
+    """Complete a recorded rollout with the log-probabilities and the values of all its steps."""
     log_probs = policy.log_prob(observations, actions)
     values = critic(policy.norm(observations))[..., 0]
     return Rollout(

@@ -1,11 +1,11 @@
-"""SSRR: rewards regressed on how performance falls as actions grow noisy (Chen, Paleja and Gombolay 2020).
+"""SSRR: rewards regressed on performance under noisy actions (Chen, Paleja and Gombolay 2020).
 
-The baseline of robust-AIRL (section 7.3). Four steps: noisy-AIRL learns a policy and a first reward from what
-the expert showed; that policy, acted out at twenty levels of noise, shows how the reward it earns falls with
-the noise (:func:`fit_noise_curve`); networks are then regressed on what that curve says each snippet of those
-trajectories is worth (:mod:`~i2rl.inference.adversarial.snippets`); and a second policy is learned from their
-mean. No demonstration beyond the first step is used, so what is learned can be better than what was shown,
-and can be far from what the expert was after (section 2.3.3).
+The baseline of robust-AIRL (section 7.3) has four steps. Noisy-AIRL learns a policy and a first reward from
+the demonstration. That policy, acting at twenty levels of noise, shows how the first reward falls with the
+noise (:func:`fit_noise_curve`). Networks are then regressed on the value that the curve gives each snippet of
+these trajectories (:mod:`~i2rl.inference.adversarial.snippets`), and a second policy is learned from their
+mean. Only the first step uses the demonstration, so the learned reward can be better than the expert's
+behaviour, and can be far from the expert's reward (section 2.3.3).
 """
 
 from __future__ import annotations
@@ -50,16 +50,16 @@ class NoiseCurve(NamedTuple):
     levels : float ``[E]``
         Probabilities of a random action.
     scores : float ``[E]``
-        What was measured, scaled to [0, 1].
+        Measured performance, scaled to [0, 1].
     values : float ``[E]``
         The fitted curve at the levels.
     parameters : float ``[4]``
         ``x0, y0, c, k`` of the sigmoid ``c / (1 + exp(-k (eps - x0))) + y0``.
     sigmoid : bool
-        Whether ``values`` are the sigmoid's; if not, they are the best decreasing curve's.
+        True if ``values`` are the sigmoid's, False if they are the best decreasing curve's.
     explained : float
-        Share of the scores' variance that ``values`` explain; 0 where the scores do not fall with the noise
-        (the first reward is then no guide, nor is what is regressed on it).
+        Share of the scores' variance that ``values`` explain; 0 if the scores do not fall with the noise
+        (the first reward then carries no information, and neither does the regression).
     """
 
     levels: Float[np.ndarray, " E"]
@@ -73,7 +73,7 @@ class NoiseCurve(NamedTuple):
 def sigmoid_curve(
     levels: Float[np.ndarray, "..."], parameters: Float[np.ndarray, "4"]
 ) -> Float[np.ndarray, "..."]:
-    """``c / (1 + exp(-k (eps - x0))) + y0`` with the parameters ``x0, y0, c, k``."""
+    """Evaluate ``c / (1 + exp(-k (eps - x0))) + y0`` with the parameters ``x0, y0, c, k``."""
     x0, y0, c, k = parameters
     return c / (1 + np.exp(-k * (np.asarray(levels) - x0))) + y0
 
@@ -88,12 +88,12 @@ def _sigmoid_slopes(levels: Float[np.ndarray, " E"], parameters: Float[np.ndarra
 def fit_noise_curve(
     levels: Float[np.ndarray, " E"], returns: Float[np.ndarray, " E"], loss: float = 0.05
 ) -> NoiseCurve:
-    """Fit mean returns at levels of noise, scaled to [0, 1], by a falling sigmoid.
+    """Fit a falling sigmoid to mean returns at levels of noise, scaled to [0, 1].
 
     Least squares from six starts within ``x0 in [-.5, 1.5]``, ``y0 in [-1, 1]``, ``c in (0, 2]`` and
-    ``k in [-200, 0)``: without bounds, as released, most published fits are no sigmoids (heights of 50 to
-    2000 above floors as deep). Where the sigmoid explains less of the scores' variance than the best
-    decreasing curve does by more than ``loss``, that curve (isotonic regression) takes its place.
+    ``k in [-200, 0)``: without bounds, as released, most published fits have no sigmoid shape (heights of 50
+    to 2000 above floors as deep). The best decreasing curve (isotonic regression) replaces the sigmoid if it
+    explains more of the scores' variance by more than ``loss``.
 
     Raises ``ValueError`` for levels outside [0, 1] or not increasing, fewer than four of them, returns of
     another shape, or numbers that are not finite (naming the level).
@@ -150,11 +150,11 @@ def rank(
     key: Array,
     average: str = "mean",
 ) -> tuple[NoiseCurve, Ranked]:
-    """Act out a policy with noise, and say from the noise alone what each trajectory is worth.
+    """Run a policy with noise, and rank each trajectory by its level of noise alone.
 
-    ``trajectories`` whole episodes at each level are scored by the sum of the state rewards ``network``, the
-    reward of the absorbing state counting for what is left of those that terminated. The curve is fitted to
-    their ``average`` at each level, "mean" or "median".
+    Each level has ``trajectories`` whole episodes, scored by the sum of the state rewards ``network``; after
+    a termination the reward of the absorbing state fills the remaining steps. The curve is fitted to their
+    ``average`` at each level, "mean" or "median".
     """
     k_start, k_roll = jax.random.split(key)
     each = np.repeat(levels, trajectories)
@@ -176,7 +176,7 @@ def rank(
 
 @jax.jit
 def _scored(network: ShapedReward, noisy: NoisyRollout) -> tuple[Float[Array, " n"], Int[Array, " n"]]:
-    """Of the first episode in each environment, its summed rewards and its length."""
+    """Return the summed rewards and the length of the first episode in each environment."""
     steps = noisy.steps("executed")
     done = noisy.rollout.terminated | noisy.rollout.truncated
     live = jnp.cumsum(done, 0) - done == 0
@@ -193,20 +193,21 @@ STARTS = ("scratch", "first")
 
 
 class SSRRTraining(NamedTuple):
-    """How a session trains, after noisy-AIRL.
+    """Settings of a session's training, after noisy-AIRL.
 
     Fields
     ------
-    levels : probabilities of a random action at which the first policy is acted out, in increasing order.
-        Scores are scaled by the least: where a robot falls and the first reward, never asked before, plunges,
-        the highest levels leave no difference among the others (for Hopper the released end at 0.75)
-    trajectories : int, episodes at each
+    levels : probabilities of a random action for the first policy's episodes, in increasing order.
+        Scores are scaled by the least. If a robot falls, the first reward may plunge outside its training
+        states, and the highest levels leave no difference among the others (for Hopper the released end at
+        0.75)
+    trajectories : int, episodes at each level
     regression : Regression
     iterations : int, of the second policy, in a session
-    average : "mean" (as released) or "median", of the scores at a level; one episode in which the first
-        reward plunges moves the mean of five a long way
-    start : "scratch" (as released, who take a million steps and more) or "first", the second policy as it
-        begins: untrained, or a copy of the first as the first session leaves it
+    average : "mean" (as released) or "median", of the scores at a level; a plunge of the first reward in one
+        episode moves the mean of five far
+    start : "scratch" (as released, with a million steps and more) or "first", the initial second policy:
+        untrained, or a copy of the first after the first session
     """
 
     levels: Sequence[float] = tuple(0.05 * i for i in range(20))
@@ -217,7 +218,7 @@ class SSRRTraining(NamedTuple):
     start: str = "scratch"
 
     def checked(self) -> SSRRTraining:
-        """Itself. Raises ``ValueError`` naming a field that cannot be."""
+        """Validate the settings and return them. Raises ``ValueError`` naming an invalid field."""
         for name in ("trajectories", "iterations"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -232,16 +233,16 @@ class SSRRTraining(NamedTuple):
 
 @shown_briefly
 class SSRRState(NamedTuple):
-    """All that is carried from session to session.
+    """State that is carried from session to session.
 
     Fields
     ------
     session : int
     key : random key
     first : AdversarialState, noisy-AIRL's
-    network : SSRRReward, the reward learned
+    network : SSRRReward, the learned reward
     optimiser : state of its Adam
-    generator : PPOState of the second policy, the one learned
+    generator : PPOState of the second policy, the learned one
     """
 
     session: Int[Array, ""]
@@ -259,24 +260,24 @@ class SSRRState(NamedTuple):
 
 @shown_briefly
 class SSRRInfo(NamedTuple):
-    """What a session did.
+    """Measures of a session.
 
     Fields
     ------
     session : int
     log_likelihood : float
-        Of the expert's reported actions under the second policy, nats a step.
+        Log-likelihood of the expert's observed actions under the second policy, nats per step.
     curve : NoiseCurve
     loss, held_out : float ``[members]``
-        Mean squared errors of the regression: on its last batch, and on snippets it did not see.
+        Mean squared errors of the regression: on its last batch, and on snippets held out.
     returns : float ``[iterations]``
         Mean return, by the environment's own reward, of the episodes that the second policy finished; NaN
-        where none ended. Learning never sees it.
-    first : AdversarialReport, noisy-AIRL's
+        if none ended. Learning does not use it.
+    first : AdversarialInfo, noisy-AIRL's
     pairs, environment_steps : int
-        Reported pairs, and steps of both policies and the ranking, in all sessions so far.
+        Observed pairs, and steps of both policies and the ranking, in all sessions so far.
     iterations : int
-        Rounds of both policies in this session.
+        Iterations of both policies in this session.
     seconds : float
     weights : float ``[P]``
     """
@@ -302,13 +303,13 @@ def ssrr(
     training: SSRRTraining | None = None,
     configuration: Mapping[str, Any] | None = None,
 ) -> Learner:
-    """SSRR as a learner of the session protocol; its demonstrations are :class:`Recording`.
+    """Build SSRR as a learner of the session protocol; its demonstrations are :class:`Recording`.
 
     A session is one of noisy-AIRL (see :func:`~i2rl.inference.adversarial.noise_injection.noisy_airl` for the
-    first three parameters), a ranking by noise, a regression and some rounds of a second policy by the reward
-    regressed. Both policies, both rewards and their optimisers go on from where the session before left them;
-    of the demonstrations and the ranked trajectories nothing is kept. Published with SAC and episodes that do
-    not end early; here ``agent`` improves both policies.
+    first three parameters), a ranking by noise, a regression and some iterations of a second policy with the
+    regressed reward. Both policies, both rewards and their optimisers continue from the session before; the
+    demonstrations and the ranked trajectories are discarded. The published method uses SAC and episodes that
+    do not end early; here ``agent`` improves both policies.
     """
     environment, settings = agent.environment, agent.settings
     how = (training or SSRRTraining()).checked()

@@ -1,7 +1,7 @@
 """Rewards regressed on snippets of trajectories of known worth: the second half of SSRR.
 
-Chen, Paleja and Gombolay (2020). A snippet's rewards are to sum to its share of what its trajectory is worth;
-an ensemble of networks is fitted to many of them in one compiled program.
+Chen, Paleja and Gombolay (2020). The rewards of a snippet should sum to its share of its trajectory's worth;
+an ensemble of networks is fitted to many snippets in one compiled program.
 """
 
 from __future__ import annotations
@@ -26,14 +26,14 @@ else:
     eqx, optax = required("equinox"), required("optax")
 
 WORTH = 10.0
-"""What a whole trajectory without noise is worth to the regression, as released."""
+"""Worth of a whole trajectory without noise in the regression, as released."""
 
 
 class Regression(NamedTuple):
-    """How rewards are regressed on snippets; the defaults are those released, and take many minutes.
+    """Settings of the regression of rewards on snippets; the released defaults take many minutes.
 
-    Less of everything: ``hidden=(64, 64), points=32, learning_rate=1e-3, deviation=0.1``. Few
-    and narrow layers need larger first weights than the released, from which they do not get away.
+    A cheaper setting: ``hidden=(64, 64), points=32, learning_rate=1e-3, deviation=0.1``. Few and narrow
+    layers need larger initial weights than the released, at which they would stay.
 
     Fields
     ------
@@ -42,14 +42,14 @@ class Regression(NamedTuple):
     snippets : int, drawn for each network
     shortest, longest : int, steps of a snippet
     points : int
-        States of a snippet at which the network is evaluated. A longer one is represented by so many of its
-        states, one drawn from each of as many equal stretches: much cheaper, and noisier.
-    batch : int, snippets an iteration
+        States of a snippet at which the network is evaluated. A longer snippet is represented by this
+        number of states, drawn one from each of as many equal stretches: much cheaper, and noisier.
+    batch : int, snippets in an iteration
     iterations : int, of Adam
     learning_rate : float
     penalty : float, of the sum of the squared weights (not biases)
-    deviation : float, of the first weights
-    held_out : float, share of the snippets not trained on
+    deviation : float, of the initial weights
+    held_out : float, share of the snippets withheld from training
     """
 
     hidden: Sequence[int] = (256, 256)
@@ -66,7 +66,7 @@ class Regression(NamedTuple):
     held_out: float = 0.2
 
     def checked(self) -> Regression:
-        """Itself. Raises ``ValueError`` naming a field that cannot be."""
+        """Validate the settings and return them. Raises ``ValueError`` naming an invalid field."""
         for name in ("members", "shortest", "points", "batch", "iterations"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -80,7 +80,7 @@ class Regression(NamedTuple):
 
     @property
     def kept(self) -> int:
-        """How many snippets are trained on."""
+        """Number of snippets for training."""
         return self.snippets - int(self.held_out * self.snippets)
 
 
@@ -89,7 +89,7 @@ class SSRRReward(eqx.Module):
 
     Fields
     ------
-    members : MLP whose arrays have a leading axis, one entry a network
+    members : MLP whose arrays have a leading axis, one entry per network
     norm : RunningNorm, of observations
     """
 
@@ -98,7 +98,7 @@ class SSRRReward(eqx.Module):
 
     @staticmethod
     def create(key: Array, observation_size: int, settings: Regression) -> SSRRReward:
-        """Networks that are nearly zero: weights normal with the settings' ``deviation``."""
+        """Create networks near zero: Gaussian weights with the settings' ``deviation``."""
         sizes = (observation_size, *settings.hidden, 1)
         keys = jax.random.split(key, len(sizes) - 1)
         weights = tuple(
@@ -109,12 +109,12 @@ class SSRRReward(eqx.Module):
         return SSRRReward(MLP(weights, biases, "relu"), RunningNorm.create(observation_size))
 
     def each(self, observations: Float[Array, "... d"]) -> Float[Array, "E ..."]:
-        """Every network's reward."""
+        """Return every network's reward."""
         z = self.norm(observations)
         return jax.vmap(lambda member: member(z)[..., 0])(self.members)
 
     def __call__(self, observations: Float[Array, "... d"], actions: Any = None) -> Float[Array, "..."]:
-        """The ensemble's mean. Actions may be given as to other rewards; they make no difference."""
+        """Return the ensemble's mean. Actions are accepted, as by other rewards, and ignored."""
         del actions
         return self.each(observations).mean(0)
 
@@ -127,7 +127,7 @@ class Ranked(NamedTuple):
     ------
     observations : float ``[n, T, d]``
     lengths : int ``[n]``
-        Fewer than ``T`` where the task ended early; what follows is not looked at.
+        Below ``T`` if the task ended early; later entries are ignored.
     worth : float ``[n]``
     """
 
@@ -138,7 +138,7 @@ class Ranked(NamedTuple):
 
 @shown_briefly
 class Snippets(NamedTuple):
-    """Stretches of trajectories, arrays ``[m]``; ``label`` is what their rewards should sum to."""
+    """Stretches of trajectories, arrays ``[m]``; ``label`` is the target of the sum of their rewards."""
 
     trajectory: Int[Array, " m"]
     start: Int[Array, " m"]
@@ -155,17 +155,17 @@ class Fit(NamedTuple):
 
 
 def snippet_lengths(settings: Regression, count: int) -> Int[np.ndarray, " m"]:
-    """Lengths evenly spread over ``shortest .. longest``, ascending: the uniform law, in strata."""
+    """Spread lengths evenly over ``shortest .. longest``, ascending: the uniform law, in strata."""
     spread = settings.longest - settings.shortest + 1
     return settings.shortest + (spread * (np.arange(count) + 0.5) / count).astype(int)
 
 
 def draw_snippets(key: Array, ranked: Ranked, lengths: Int[np.ndarray, " m"]) -> Snippets:
-    """Snippets of the given lengths: trajectory and start uniform; the whole of a shorter trajectory.
+    """Draw snippets of the given lengths: trajectory and start uniform; the whole of a shorter trajectory.
 
-    A snippet's label is ``10 worth length / T``. A trajectory that ended early counts as if it had gone on
-    for all ``T`` steps: divided by its own length, as released (for tasks that do not end), the steps of the
-    shortest failures would be worth most.
+    A snippet's label is ``10 worth length / T``. A trajectory that ended early is divided by all ``T`` steps:
+    divided by its own length, as released (for tasks that do not end), the steps of the shortest failures
+    would be worth most.
     """
     k_which, k_start = jax.random.split(key)
     which = jax.random.randint(k_which, lengths.shape, 0, len(ranked.lengths))
@@ -177,7 +177,7 @@ def draw_snippets(key: Array, ranked: Ranked, lengths: Int[np.ndarray, " m"]) ->
 
 
 class Packing(NamedTuple):
-    """Where the states of a batch of snippets lie in one array ``[N]`` without gaps; each slot's room."""
+    """Positions of the states of a batch of snippets in one dense array ``[N]``, and each slot's room."""
 
     slot: Int[np.ndarray, " N"]
     place: Int[np.ndarray, " N"]
@@ -196,7 +196,7 @@ class Packing(NamedTuple):
         batch: Snippets,
         key: Array,
     ) -> Float[Array, " B"]:
-        """Sums of rewards over a batch of snippets that fit their slots."""
+        """Sum rewards over a batch of snippets that fit their slots."""
         points = jnp.minimum(batch.length, jnp.asarray(self.room))
         u = jax.random.uniform(key, self.slot.shape, DTYPE)
         # A snippet no longer than its slot is taken whole: stretch i is then state i, whatever was drawn.
@@ -211,13 +211,13 @@ class Packing(NamedTuple):
 
 
 def snippet_regression(settings: Regression) -> tuple[Callable[[SSRRReward], Any], Callable[..., tuple]]:
-    """Regression of an ensemble's sums over snippets on their labels, all of it in one compiled program.
+    """Build the regression of an ensemble's sums over snippets on their labels, in one compiled program.
 
-    Returns ``init(reward) -> memory``, Adam's, and ``regress(reward, memory, ranked, key) -> (reward, memory,
-    Fit)``. The loss of a network is ``mean (sum_t r(s_t) - label)^2 + penalty * |W|^2``; each has snippets of
-    its own. A batch has one snippet from each stratum of lengths, so that it fills an array of one size: 45 %
-    fewer states than padding each to the longest. Inputs are scaled by the normaliser, which takes the ranked
-    states in first (the released networks see raw observations).
+    Returns ``init(reward) -> memory`` of Adam and ``regress(reward, memory, ranked, key) -> (reward, memory,
+    Fit)``. The loss of a network is ``mean (sum_t r(s_t) - label)^2 + penalty * |W|^2``; each network has its
+    own snippets. A batch has one snippet from each stratum of lengths, so that it fills an array of one size:
+    45 % fewer states than padding each to the longest. Inputs are scaled by the normaliser, which first
+    includes the ranked states (the released networks see raw observations).
     """
     settings = settings.checked()
     optimiser = optax.adam(settings.learning_rate)
@@ -225,7 +225,7 @@ def snippet_regression(settings: Regression) -> tuple[Callable[[SSRRReward], Any
     held = snippet_lengths(settings, settings.snippets - settings.kept)
     stratum = settings.kept // settings.batch
     packing = Packing.of(np.minimum(kept[stratum - 1 :: stratum][: settings.batch], settings.points))
-    # The snippets held out are judged in batches as well, the last of which repeats some.
+    # The held-out snippets are evaluated in batches as well; the last batch repeats some.
     rows = np.minimum(np.arange(-(-len(held) // settings.batch) * settings.batch), len(held) - 1)
     judging = rows.reshape(-1, settings.batch)
     wide = Packing.of(np.full(settings.batch, min(settings.longest, settings.points)))
@@ -274,7 +274,7 @@ def snippet_regression(settings: Regression) -> tuple[Callable[[SSRRReward], Any
             return member, memory, Fit(errors[-1], jnp.mean(left.reshape(-1)[: len(held)]))
 
         keys = jax.random.split(key, settings.members)
-        # One network after the other: each already keeps every core busy.
+        # One network after the other: each already uses every core.
         members, memory, fit = lax.map(lambda x: one(*x), (reward.members, memory, keys))
         return SSRRReward(members, norm), memory, fit
 
@@ -284,7 +284,7 @@ def snippet_regression(settings: Regression) -> tuple[Callable[[SSRRReward], Any
 def _taken_in(
     norm: RunningNorm, observations: Float[Array, "n T d"], live: Bool[Array, "n T"]
 ) -> RunningNorm:
-    """The normaliser with the live states taken in (their number is known only to the data)."""
+    """Add the live states to the normaliser (their number is known only to the data)."""
     weight = live[..., None].astype(DTYPE)
     n = jnp.sum(weight)
     mean = jnp.sum(weight * observations, (0, 1)) / n

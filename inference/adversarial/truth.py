@@ -1,6 +1,6 @@
-"""Samples of what an expert did, given reports: by what rule, and how many.
+"""Draws of an expert's steps given observations, and their number.
 
-Lines 6-15 of Algorithm 3: the truth is sampled until the average logit of the discriminator settles.
+Lines 6-15 of Algorithm 3: the truth is drawn until the average logit of the discriminator settles.
 """
 
 from __future__ import annotations
@@ -20,61 +20,61 @@ from .discriminator import ExpertTransitions, Transitions
 
 
 class Truth(Protocol):
-    """What the expert did, given reports: one object for each way to deal with noise."""
+    """The expert's steps, given observations: one object for each treatment of noise."""
 
     def prior(self) -> Any:
-        """The sensor before the first session, as arrays (empty where there is nothing to know)."""
+        """Return the sensor before the first session, as arrays (empty if there is none)."""
 
     def begin(self, recording: Recording, sensor: Any, key: Array) -> Any:
-        """The chain's state before the first look at a session's reports."""
+        """Return the chain's state before the first refresh of a session."""
 
     def refresh(self, chain: Any, sensor: Any, policy: Policy, key: Array) -> tuple[Any, ExpertTransitions]:
-        """Samples of the truth under the current policy, and the chain to go on from."""
+        """Draw the truth under the current policy; return the chain and the draws."""
 
     def more(self, chain: Any, sensor: Any, policy: Policy, key: Array) -> tuple[Any, ExpertTransitions]:
-        """As many further samples under the same policy."""
+        """Draw again under the same policy."""
 
     def learned(self, chain: Any, sensor: Any) -> Any:
-        """The sensor after a session: as it was, or fitted to it."""
+        """Return the sensor after a session, unchanged or fitted to it."""
 
 
 class FaceValue:
-    """Reports taken for the truth: AIRL and GAIL as they are, on clean or noisy input."""
+    """Observations taken for the truth: plain AIRL and GAIL, on clean or noisy input."""
 
     def prior(self) -> tuple:
-        """Nothing."""
+        """Return an empty sensor."""
         return ()
 
     def begin(self, recording: Recording, sensor: tuple, key: Array) -> Recording:
-        """The reports."""
+        """Return the observations."""
         return recording
 
     def refresh(
         self, chain: Recording, sensor: tuple, policy: Policy, key: Array
     ) -> tuple[Recording, ExpertTransitions]:
-        """The reports as one sample."""
+        """Return the observations as one draw."""
         return chain, reported_steps(chain)
 
     def more(
         self, chain: Recording, sensor: tuple, policy: Policy, key: Array
     ) -> tuple[Recording, ExpertTransitions]:
-        """The same again."""
+        """Return the same draw again."""
         return self.refresh(chain, sensor, policy, key)
 
     def learned(self, chain: Recording, sensor: tuple) -> tuple:
-        """Nothing."""
+        """Return an empty sensor."""
         return sensor
 
 
 @shown_briefly
 class Sampled(NamedTuple):
-    """What a look at a session's reports found.
+    """Result of a refresh of a session's draws.
 
     Fields
     ------
-    chain : the truth's, to go on from
+    chain : the truth's, to continue from
     expert : ExpertTransitions
-    draws : int, made of the truth
+    draws : int, number of draws of the truth
     """
 
     chain: Any
@@ -99,12 +99,12 @@ def look(
     logits: Callable[[Transitions], Float[Array, "N M"]],
     settling: Settling = Settling(),  # noqa: B008 (immutable)
 ) -> Sampled:
-    """Sample the truth until the average logit of its steps settles.
+    """Draw the truth until the average logit of its steps settles.
 
-    A move is the mean over steps of the absolute change of the average with one more sampling. (Algorithm 3
-    as printed compares an average with itself; as released, it sums over a batch and as many generated steps,
-    so that what it means depends on the batch.) Whatever is made, samples have the one shape, for which is
-    compiled: those that were not drawn weigh nothing. Actions are those of :func:`within_bounds`.
+    The move is the mean over steps of the absolute change of the average with one more draw. (Algorithm 3 as
+    printed compares an average with itself; the released code sums over a batch and as many generated steps,
+    so that the threshold depends on the batch.) The result has one shape, so that programs compile once;
+    missing draws have weight zero. Actions are those of :func:`within_bounds`.
     """
     change, most = settling
     chain, first = truth.refresh(chain, sensor, policy, key)
@@ -129,7 +129,7 @@ def _mean(expert: ExpertTransitions, logits: Float[Array, "N M"]) -> Float[Array
 
 
 def _pooled(drawn: Sequence[ExpertTransitions], most: int) -> ExpertTransitions:
-    """All samples, each sampling counting alike, with room for ``most`` samplings."""
+    """Pool all draws with equal weights, with room for ``most`` draws."""
     absent = most - len(drawn)
     every = [*drawn, *[drawn[0]._replace(weights=0 * drawn[0].weights)] * absent]
     steps = jax.tree.map(lambda *x: jnp.concatenate(x, 1), *(x.steps for x in every))
@@ -138,7 +138,7 @@ def _pooled(drawn: Sequence[ExpertTransitions], most: int) -> ExpertTransitions:
 
 
 def reported_steps(recording: Recording) -> ExpertTransitions:
-    """The reports as transitions: of each trajectory all steps with a successor, or a termination."""
+    """Return the observations as transitions: all steps with a successor or a termination."""
     observations = jnp.asarray(recording.observations)
     following = jnp.concatenate([observations[:, 1:], observations[:, -1:]], 1)
     ends = recording.last & recording.terminated[:, None]
@@ -148,8 +148,8 @@ def reported_steps(recording: Recording) -> ExpertTransitions:
 
 
 def within_bounds(actions: ActionSpace, expert: ExpertTransitions) -> ExpertTransitions:
-    """Reported actions cut to their bounds, as generated ones are.
+    """Clip observed actions to their bounds, as generated ones are.
 
-    Noise beyond the bounds would tell the two apart whatever either does.
+    Noise beyond the bounds would distinguish the two sides whatever either does.
     """
     return expert._replace(steps=expert.steps._replace(actions=actions.clip(expert.steps.actions)))

@@ -1,4 +1,4 @@
-"""A round's updates of a discriminator, compiled: rows drawn, inputs scaled, Adam's steps."""
+"""One iteration of a discriminator, compiled: drawn rows, scaled inputs, steps of Adam."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ else:
 
 
 class Objective(Protocol):
-    """What an update makes small."""
+    """Loss that a step of the discriminator minimises."""
 
     def __call__(
         self,
@@ -34,21 +34,21 @@ class Objective(Protocol):
         places: Int[Array, " B"],
         key: Array,
     ) -> tuple[Float[Array, ""], Losses]:
-        """The loss of expert steps ``[B, M]`` and generated ones ``[B]``, and what is told of it.
+        """Return the loss of expert steps ``[B, M]`` and generated ones ``[B]``, and its measures.
 
-        ``places`` says where in a round's steps, and in which round, each generated one stood.
+        ``places`` are the positions of the generated steps in the replay: iteration and step.
         """
 
 
 def discriminator_updates(
     objective: Objective, updates: int, batch: int, learning_rate: float
 ) -> tuple[Callable[[ShapedReward], Any], Callable[..., tuple[ShapedReward, Any, Losses]]]:
-    """The optimiser's first state, and all of a round's updates in one compiled program.
+    """Build the optimiser's initial state, and all steps of an iteration in one compiled program.
 
     The second is ``(network, memory, policy, expert, replay, filled, key) -> (network, memory, losses)``:
     ``expert`` is :class:`ExpertTransitions`, ``replay`` generated steps ``[K, B, ...]`` of which the first
-    ``filled`` rounds count, and the losses are those of the last update. The network's normaliser takes in
-    one batch of each side a round.
+    ``filled`` iterations count, and the losses are those of the last step. The network's normaliser includes
+    one batch of each side per iteration.
     """
     optimiser = optax.adam(learning_rate)
 

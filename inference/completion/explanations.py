@@ -1,8 +1,8 @@
-"""A jumble of trajectories as a mixture sees it: how well each way of doing the task explains each one.
+"""A demonstration under a mixture: how well each component explains each trajectory.
 
-Trajectories that were seen whole need no completion: their visits are known, and their log-likelihood is
-linear in the log-policy. Where any step was hidden, lost or misread, every trajectory is completed under
-every way by a forward-backward pass.
+Fully seen trajectories need no completion: their visits are known, and their log-likelihood is linear in the
+log-policy. If any step was hidden, lost or noisy, a forward-backward pass completes every trajectory under
+every component.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from .smoothing import Evidence, evidence_of, smooth_all
 
 @shown_briefly
 class SeenWhole(NamedTuple):
-    """Fully seen trajectories: visits, log-probability of what no reward changes, and which rows exist."""
+    """Fully seen trajectories: visits, log-probability of the dynamics, and which rows exist."""
 
     visits: Float[Array, "n S A"]
     constant: Float[Array, " n"]
@@ -45,12 +45,12 @@ Trajectories = SeenWhole | SeenInPart
 
 @shown_briefly
 class Explained(NamedTuple):
-    """A jumble under one way of doing the task.
+    """A demonstration under one component.
 
     Fields
     ------
     log_likelihood : float ``[n]``
-        Exact, hidden steps summed out; ``-inf`` where the way cannot have produced the trajectory.
+        Exact, hidden steps summed out; ``-inf`` if the component cannot produce the trajectory.
     visits : float ``[n, S, A]``
         Expected visits of all steps.
     seen : float ``[n, S, A]``
@@ -63,7 +63,7 @@ class Explained(NamedTuple):
 
 
 def is_seen_whole(sensor: AnySensor, demonstration: Demonstration) -> bool:
-    """Whether every step was perceived exactly, state and action."""
+    """Return whether every step was observed exactly, state and action."""
     kind, state, action, _ = (np.asarray(x) for x in demonstration.arrays)
     gaps = (kind == HIDDEN) | (kind == LOST) | ((kind == SEEN) & ((state == UNKNOWN) | (action == UNKNOWN)))
     return sensor.noise is None and not gaps.any()
@@ -114,11 +114,11 @@ def explain_each(
 ) -> Explained:
     """Explain every trajectory by every policy: fields as in :class:`Explained`, with a leading ``D``.
 
-    Those of policies that are not ``present`` may be anything finite.
+    Those of policies that are not ``present`` are arbitrary finite numbers.
     """
     if isinstance(trajectories, SeenWhole):
         return jax.vmap(lambda x: explain(mdp, x, trajectories))(log_policies)
-    # One policy at a time: a pass holds [n, L, S, A] posteriors, which ways should not multiply.
+    # One policy at a time: a pass holds [n, L, S, A] posteriors, which components should not multiply.
     if present is None:
         return lax.map(lambda x: explain(mdp, x, trajectories), log_policies)
     n = len(trajectories.live)
@@ -130,6 +130,6 @@ def explain_each(
 
 
 def without_reward(mdp: TabularMDP, trajectories: Trajectories) -> Explained:
-    """Explain every trajectory by somebody who does anything: what is known before any reward is."""
+    """Explain every trajectory by the uniform policy, before any reward is known."""
     uniform = jnp.where(mdp.available, -jnp.log(jnp.sum(mdp.available, axis=1))[:, None], -jnp.inf)
     return explain(mdp, uniform, trajectories)

@@ -1,15 +1,15 @@
 """The truth behind noisy recordings of continuous states and actions: Technique 2 of section 6.2.3.
 
 Every term of Eq. 6.10 is Gaussian about a function of the truth: T1 and T3 ``s_{t+1} ~ N(f(s_t, a_t), Q)``,
-T2 ``a_t ~ pi(. | s_t)``, T4 and T5 the sensor, whose data are the *reports*; ``s_0`` has a wide Gaussian.
-The pairs of a trajectory then are one chain, and its joint posterior is found by an iterated Kalman smoother:
-dynamics and policy are replaced by affine functions about the posterior so far, the affine chain is smoothed
-exactly, and so on (posterior linearisation; García-Fernández, Svensson and Särkkä 2017).
+T2 ``a_t ~ pi(. | s_t)``, T4 and T5 the sensor, whose data are the observations; ``s_0`` has a wide Gaussian.
+The pairs of a trajectory form one chain, and an iterated Kalman smoother finds its joint posterior: dynamics
+and policy are replaced by affine functions about the posterior so far, the affine chain is smoothed exactly,
+and so on (posterior linearisation; García-Fernández, Svensson and Särkkä 2017).
 
-Slopes are taken across the posterior, by divided differences along its axes, and what an affine function
-leaves over of the dynamics is added to ``Q`` (Nørgaard, Poulsen and Ravn 2000). So a foot that may or may not
-touch the ground loosens its own step and no other, and tightens it again as the posterior narrows; slopes at
-a point (the extended Kalman smoother) make velocities *worse* than the reports there. For affine dynamics and
+Slopes are taken across the posterior, by divided differences along its axes, and the residual of the affine
+function is added to ``Q`` (Nørgaard, Poulsen and Ravn 2000). A foot that may or may not touch the ground
+thereby loosens its own step only, and tightens it again as the posterior narrows; slopes at a point (the
+extended Kalman smoother) make velocities *worse* than the observations there. For affine dynamics and
 policies the first pass is exact. :mod:`~i2rl.inference.completion.gibbs` samples the posterior without the
 approximation.
 """
@@ -51,12 +51,13 @@ from .kalman import (
 )
 
 FURTHEST = 6.0
-"""Standard deviations of the sensor beyond which a report is not believed to be from the truth."""
+"""Standard deviations of the sensor beyond which an observation is discounted."""
 
 CAUTION = ((1.0, 30.0), (3.0, 20.0), (2.0, 10.0), (1.5, 5.0), (1.0, 3.0))
-"""Of the first passes and, the last of them, of all later ones: by how much the posterior is widened before
-differences are taken across it, and by how much what they leave over counts (they see each axis, not how axes
-bend together). Nothing where the dynamics are affine."""
+"""Caution of the first passes and, the last entry, of all later ones: factors that widen the posterior before
+differences are taken, and that scale their residual (they see each axis, not the axes' common curvature).
+Both
+are neutral for affine dynamics."""
 
 _FAR = 30.0  # deviations from a bound at which it makes no difference
 _LEAST_DEVIATION = 0.03
@@ -65,13 +66,13 @@ _REACH = 3.0**0.5  # in deviations: matches a Gaussian's fourth moment
 
 
 class Dynamics(Protocol):
-    """What follows a state and an action, without noise; in JAX or, like MuJoCo, in NumPy."""
+    """Noise-free successors of states and actions; in JAX or, like MuJoCo, in NumPy."""
 
     def next_state(self, states: Any, actions: Any) -> Any:
-        """Next states ``[n, d]`` after states ``[n, d]`` and actions ``[n, k]``."""
+        """Return next states ``[n, d]`` after states ``[n, d]`` and actions ``[n, k]``."""
 
     def jacobians(self, states: Any, actions: Any) -> tuple[Any, Any]:
-        """Derivatives by the state, ``[n, d, d]``, and by the action, ``[n, d, k]``."""
+        """Return derivatives by the state, ``[n, d, d]``, and by the action, ``[n, d, k]``."""
 
 
 @shown_briefly
@@ -83,26 +84,26 @@ class JaxDynamics(NamedTuple):
 
 
 def jax_dynamics(f: Callable[[Array, Array], Array]) -> JaxDynamics:
-    """Dynamics of a differentiable function of one state ``[d]`` and one action ``[k]``, in JAX."""
+    """Compile dynamics from a differentiable function of one state ``[d]`` and one action ``[k]``, in JAX."""
     return JaxDynamics(jax.jit(jax.vmap(f)), jax.jit(jax.vmap(jax.jacfwd(f, (0, 1)))))
 
 
 @shown_briefly
 class TruthChain(NamedTuple):
-    """What is kept between calls: the reports, the posterior so far and the dynamics linearised across it.
+    """State between calls: the observations, the posterior so far and the dynamics linearised across it.
 
     Fields
     ------
     reported : Recording
     means, covariances : float ``[n, L, D]``, ``[n, L, D, D]``
-        Of the pairs ``(s, a)``, ``D = d + k``.
+        Posterior of the pairs ``(s, a)``, ``D = d + k``.
     following, slope : float ``[n, L, d]``, ``[n, L, d, D]``
         Value and slope of ``f`` at ``centre``.
     centre : float ``[n, L, D]``
     remainder : float ``[n, L, d, d]``
-        Covariance of what the affine function leaves over.
+        Covariance of the affine function's residual.
     passes : int
-        Made so far.
+        Number of passes so far.
     """
 
     reported: Recording
@@ -117,7 +118,7 @@ class TruthChain(NamedTuple):
 
 @shown_briefly
 class Bounds(NamedTuple):
-    """Within which the pairs ``(s, a)`` lie, ``[D]`` or a number."""
+    """Bounds of the pairs ``(s, a)``, ``[D]`` or a number."""
 
     low: Float[Array, "*D"]
     high: Float[Array, "*D"]
@@ -125,7 +126,7 @@ class Bounds(NamedTuple):
 
 @shown_briefly
 class Model(NamedTuple):
-    """The law of the truth but for the policy: ``Q [d, d]`` and the Gaussian of ``s_0``."""
+    """Law of the truth without the policy: ``Q [d, d]`` and the Gaussian of ``s_0``."""
 
     process_covariance: Float[Array, "d d"]
     initial_mean: Float[Array, " d"]
@@ -133,10 +134,10 @@ class Model(NamedTuple):
 
 
 def policy_moments(policy: Any, observations: Float[Array, "... d"]) -> tuple[Array, Array]:
-    """Mean ``[..., k]`` and covariance ``[..., k, k]`` of a policy's action, in 64 bits.
+    """Return mean ``[..., k]`` and covariance ``[..., k, k]`` of a policy's action, in 64 bits.
 
-    Its own ``moments`` where it has them (a mixture is matched by its first two); otherwise ``mode`` and
-    ``log_deviation``, as of :class:`~i2rl.models.networks.modules.GaussianPolicy`.
+    They are its own ``moments`` if it has them (a mixture is matched by its first two), otherwise ``mode``
+    and ``log_deviation``, as of :class:`~i2rl.models.networks.modules.GaussianPolicy`.
     """
     if hasattr(policy, "moments"):
         mean, covariance = policy.moments(observations)
@@ -149,10 +150,11 @@ def policy_moments(policy: Any, observations: Float[Array, "... d"]) -> tuple[Ar
 
 
 def executed_moments(policy: Any, bounds: Bounds, observations: Float[Array, "... d"]) -> tuple[Array, Array]:
-    """Mean and covariance of a policy's action once it is cut to its bounds, as environments do.
+    """Return mean and covariance of a policy's action after clipping to its bounds, as in environments.
 
-    A policy whose mean lies far outside means the bound, and says nothing of the state. Components are those
-    of a censored normal; their correlations are kept. Without bounds :func:`policy_moments`.
+    A policy whose mean lies far outside always acts at the bound, and carries no information about the state.
+    Components are those of a censored Gaussian; their correlations are preserved. Without bounds this is
+    :func:`policy_moments`.
     """
     mean, covariance = policy_moments(policy, observations)
     if bounds.low.ndim == 0:
@@ -178,7 +180,7 @@ def _caution(passes: Array) -> tuple[Array, Array]:
 
 
 def _points(centre: Float[Array, "... D"], covariance: Float[Array, "... D D"]) -> tuple[Array, Array]:
-    """A Cholesky factor, and the centre and both ends of each axis, ``[..., 1 + 2 D, D]``."""
+    """Return a Cholesky factor, and the centre and both ends of each axis, ``[..., 1 + 2 D, D]``."""
     slack = 1e-14 * jnp.trace(covariance, axis1=-2, axis2=-1)[..., None, None] * jnp.eye(centre.shape[-1])
     factor = jnp.linalg.cholesky(covariance + slack)
     axes, middle = _REACH * factor.swapaxes(-1, -2), centre[..., None, :]
@@ -186,7 +188,7 @@ def _points(centre: Float[Array, "... D"], covariance: Float[Array, "... D D"]) 
 
 
 def _differences(factor: Array, values: Float[Array, "... P m"]) -> tuple[Array, Array, Array]:
-    """Mean ``[..., m]``, slope ``[..., m, D]`` and covariance of the rest of values at :func:`_points`."""
+    """Return mean ``[..., m]``, slope ``[..., m, D]`` and residual covariance of values at the points."""
     D = factor.shape[-1]
     middle, up, down = values[..., 0, :], values[..., 1 : D + 1, :], values[..., D + 1 :, :]
     bend = up + down - 2 * middle[..., None, :]
@@ -198,9 +200,9 @@ def _differences(factor: Array, values: Float[Array, "... P m"]) -> tuple[Array,
 def _affine_chains(
     model: Model, bounds: Bounds, policy: Any, sensor: GaussianSensor, chain: TruthChain
 ) -> AffineGaussian:
-    """The chain of pairs ``(s, a)``, linearised; every field with a leading ``n``.
+    """Build the linearised chain of pairs ``(s, a)``; every field with a leading ``n``.
 
-    The action is drawn from the state it is taken in: ``a' = mu + K (s' - s0') + N(0, Sigma)``, hence
+    The action depends on the state it is taken in: ``a' = mu + K (s' - s0') + N(0, Sigma)``, hence
     ``(s', a')`` has the transition ``[I; K] [A, B]`` and the noise ``[I; K] Q [I; K]' + diag(0, Sigma)``.
     """
     n, length, d, D = chain.slope.shape
@@ -220,7 +222,7 @@ def _affine_chains(
     offset = jnp.einsum("ntij,ntj->nti", lift[:, 1:], start[:, :-1]).at[..., d:].add(intercept[:, 1:])
     first = jnp.einsum("nij,j->ni", lift[:, 0], model.initial_mean).at[:, d:].add(intercept[:, 0])
     R = jax.scipy.linalg.block_diag(sensor.state_covariance, sensor.action_covariance)
-    # Beyond a trajectory's end anything finite will do, and zeros cannot grow.
+    # Beyond a trajectory's end any finite number is allowed, and zeros cannot grow.
     followed = chain.reported.followed[:, :-1, None, None]
     return AffineGaussian(
         first,
@@ -258,7 +260,7 @@ def draw_gaussian(key: Array, filtered: GaussianFiltered, draws: int) -> Float[A
 def log_density(
     filtered: GaussianFiltered, reported: Recording, pairs: Float[Array, "M n L D"]
 ) -> Float[Array, "M n"]:
-    """Log-density of truths under the linearised posterior."""
+    """Return the log-density of truths under the linearised posterior."""
 
     def one(inputs: tuple) -> Float[Array, " M"]:
         passed, live, drawn = inputs
@@ -269,7 +271,7 @@ def log_density(
 
 @jax.jit
 def _axes(bounds: Bounds, sensor: GaussianSensor, chain: TruthChain) -> tuple[Array, Array, Array]:
-    """Centre, Cholesky factor, and the points of the differences ``[n, L, 1 + 2 D, D]``."""
+    """Return centre, Cholesky factor, and the points of the differences ``[n, L, 1 + 2 D, D]``."""
     reports = jnp.concatenate([chain.reported.observations, chain.reported.actions], -1)
     radius = FURTHEST * jnp.sqrt(
         jnp.concatenate([jnp.diagonal(sensor.state_covariance), jnp.diagonal(sensor.action_covariance)])
@@ -281,7 +283,7 @@ def _axes(bounds: Bounds, sensor: GaussianSensor, chain: TruthChain) -> tuple[Ar
 
 @jax.jit
 def _across(chain: TruthChain, centre: Array, factor: Array, values: Float[Array, "n L P d"]) -> TruthChain:
-    """The affine function through the values at the points of :func:`_axes`."""
+    """Fit the affine function through the values at the points of :func:`_axes`."""
     following, slope, rest = _differences(factor, values)
     return chain._replace(
         following=following,
@@ -302,9 +304,9 @@ def log_joint(
     actions: Float[Array, "*m n L k"],
     following: Float[Array, "*m n L d"],
 ) -> Float[Array, "*m n"]:
-    """Exact log-density of a truth together with the reports, in nats, per trajectory.
+    """Return the exact joint log-density of a truth and the observations, in nats, per trajectory.
 
-    ``following`` is ``f(s_t, a_t)``; what it is beyond a trajectory's end does not matter.
+    ``following`` is ``f(s_t, a_t)``; its values beyond a trajectory's end are ignored.
     """
     start = log_normal(observations[..., 0, :] - model.initial_mean, model.initial_covariance)
     moves = log_normal(observations[..., 1:, :] - following[..., :-1, :], model.process_covariance)
@@ -322,8 +324,8 @@ class GaussianTruth(NamedTuple):
     """Smoothing and joint draws of the truth behind a recording; made by :func:`gaussian_truth`.
 
     ``init(recording, sensor) -> chain``, ``refresh(chain, policy, key, sensor) -> (chain, truths)``. Chains
-    persist: the next refresh goes on where the last one ended, so that after the first one a single pass will
-    do. ``resample`` draws anew, under another policy or sensor, without asking the dynamics.
+    persist: the next refresh continues the last one, so that a single pass suffices after the first.
+    ``resample`` draws anew, under another policy or sensor, without evaluating the dynamics.
     """
 
     dynamics: Any
@@ -332,9 +334,9 @@ class GaussianTruth(NamedTuple):
     draws: int
 
     def init(self, reported: Recording, sensor: GaussianSensor) -> TruthChain:
-        """Start at the reports, as uncertain as the sensor is; nothing is linearised yet.
+        """Start at the observations, with the sensor's uncertainty and no linearisation.
 
-        Raises ``ValueError`` where the sizes are not the model's, and ``TypeError`` for another sensor.
+        Raises ``ValueError`` if the sizes differ from the model's, and ``TypeError`` for another sensor.
         """
         if not isinstance(sensor, GaussianSensor):
             raise TypeError(f"sensor must be a GaussianSensor; got {described(sensor)}")
@@ -367,7 +369,7 @@ class GaussianTruth(NamedTuple):
     def refresh(
         self, chain: TruthChain, policy: Any, key: Array, sensor: GaussianSensor, passes: int = 1
     ) -> tuple[TruthChain, Truths]:
-        """Draws ``[M, n, L, .]`` after so many passes: 5 or more at first, then one a call will do.
+        """Draw ``[M, n, L, .]`` after this number of passes: 5 or more at first, later one per call.
 
         Raises ``ValueError`` for fewer than one pass (:meth:`resample` draws without).
         """
@@ -378,7 +380,7 @@ class GaussianTruth(NamedTuple):
     def smooth(
         self, chain: TruthChain, policy: Any, sensor: GaussianSensor, passes: int = 1
     ) -> tuple[TruthChain, GaussianFiltered]:
-        """Relinearise and smooth so many times; :meth:`refresh` draws from what this returns."""
+        """Relinearise and smooth this number of times; :meth:`refresh` draws from the result."""
         if passes < 1:
             raise ValueError(f"passes must be at least 1, got {passes}")
         sensor = self._sized(sensor, chain)
@@ -391,16 +393,16 @@ class GaussianTruth(NamedTuple):
         return chain, filtered
 
     def resample(self, chain: TruthChain, policy: Any, key: Array, sensor: GaussianSensor) -> Truths:
-        """Draws with the dynamics as last linearised; one :meth:`refresh` must have gone before."""
+        """Draw with the dynamics as last linearised, after at least one :meth:`refresh`."""
         filtered = _filter(self.model, self.bounds, policy, self._sized(sensor, chain), chain)
         return _bounded_truths(self.bounds, chain.reported, draw_gaussian(as_key(key), filtered, self.draws))
 
     def posterior(self, chain: TruthChain, policy: Any, sensor: GaussianSensor) -> GaussianSmoothed:
-        """Moments of the pairs ``(s, a)``, with the dynamics as last linearised, and the log-likelihood."""
+        """Return moments of the pairs ``(s, a)`` and the log-likelihood, with the last linearisation."""
         return _smooth(_filter(self.model, self.bounds, policy, self._sized(sensor, chain), chain))
 
     def estimate(self, chain: TruthChain) -> tuple[Float[Array, "n L d"], Float[Array, "n L k"]]:
-        """Posterior means of states and actions, within the bounds."""
+        """Return posterior means of states and actions, within the bounds."""
         means = jnp.clip(chain.means, self.bounds.low, self.bounds.high)
         d = chain.slope.shape[2]
         return means[..., :d], means[..., d:]
@@ -414,7 +416,7 @@ class GaussianTruth(NamedTuple):
         if isinstance(self.dynamics, JaxDynamics):
             flat = points.reshape(-1, points.shape[-1])
             return self.dynamics.next_state(flat[:, :d], flat[:, d:]).reshape(*points.shape[:-1], d)
-        # Simulators are asked only about steps that exist.
+        # Simulators are evaluated only at steps that exist.
         there, host = np.asarray(reported.followed), np.asarray(points)
         flat = host[there].reshape(-1, host.shape[-1])
         following = np.zeros((*host.shape[:-1], d))
@@ -441,7 +443,7 @@ def gaussian_truth(
     action_bounds: tuple[ArrayLike, ArrayLike] | None = None,
     draws: int = 4,
 ) -> GaussianTruth:
-    """The truth under given dynamics.
+    """Build the truth under given dynamics.
 
     Parameters
     ----------
@@ -449,17 +451,17 @@ def gaussian_truth(
         Only ``next_state`` is used.
     observation_size : int, ``d``
     process_covariance : number, ``[d]`` or ``[d, d]``
-        ``Q``: how far a step may be from what the dynamics say.
+        ``Q``: covariance of a step about the dynamics.
     initial_mean, initial_covariance : ``[d]`` (zeros by default); number, ``[d]`` or ``[d, d]``
     observation_bounds, action_bounds : pairs of ``[d]`` and of ``[k]``, or None
-        Between which the truth lies: estimates and draws are cut to them, and the policy's actions are
-        believed to be (:func:`executed_moments`). Both or neither.
+        Bounds of the truth: estimates and draws are clipped to them, and so are the policy's actions in the
+        model (:func:`executed_moments`). Both or neither.
     draws : int, ``M``
 
     Raises
     ------
     ValueError
-        For covariances that are none or of another size, bounds out of order, and no draws.
+        For invalid covariances or those of another size, bounds out of order, and no draws.
     """
     if draws < 1:
         raise ValueError(f"draws must be at least 1, got {draws}")
@@ -495,7 +497,7 @@ def gaussian_truth(
 
 @partial(jax.jit, static_argnums=2)
 def fitted_sensor(reported: Recording, posterior: GaussianSmoothed, full: bool = False) -> GaussianSensor:
-    """The sensor under which the reports are likeliest, given the posterior (the M-step).
+    """Fit the sensor to the observations by maximum likelihood, given the posterior (the M-step).
 
     Covariances are means of ``E[(o - x)(o - x)']`` over all steps; their diagonals unless ``full``.
     """

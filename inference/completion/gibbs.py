@@ -1,17 +1,17 @@
-"""Gibbs sweeps over the truth behind continuous recordings, corrected by Metropolis and Hastings.
+"""Gibbs sampling of the truth behind continuous recordings, corrected by Metropolis and Hastings.
 
 The dissertation's sampler (Eq. 6.10, Technique 2) as an exact one. A state given its Markov blanket, or an
 action, is proposed from a Gaussian in information form, the dynamics and the policy linearised about the
-present value, and accepted by the exact densities; the reverse proposal has its own linearisation. Given all
-odd steps the even ones are independent, and given the states so are the actions, so a sweep is three updates
-of everything at once. With affine dynamics and policy every proposal is accepted.
+current value, and accepted by the exact densities; the reverse proposal has its own linearisation. Given all
+odd steps the even ones are independent, and given the states so are the actions, so an iteration is three
+updates of everything at once. With affine dynamics and policy every proposal is accepted.
 
-Neighbours that follow each other closely (small ``Q``) move each other slowly, however many proposals are
-accepted. So chains start about the posterior of :mod:`~i2rl.inference.completion.gaussian`'s smoother, each
-from its own draw and further out, and every sweep also moves whole trajectories: by steps that would leave
-the smoother's posterior as it is (preconditioned Crank-Nicolson; Cotter et al. 2013), accepted by how the
-exact posterior differs from it. Steps that hardly move all the same are a warning. The smoother is the
-default, and this its check. Bounds are not imposed here.
+Tightly coupled neighbours (small ``Q``) move each other slowly, however many proposals are accepted. Chains
+therefore start about the posterior of :mod:`~i2rl.inference.completion.gaussian`'s smoother, each from its
+own draw and further out, and every iteration also moves whole trajectories: by steps that preserve the
+smoother's posterior (preconditioned Crank-Nicolson; Cotter et al. 2013), accepted by the ratio of the exact
+posterior to it. Steps that hardly move raise a warning. The smoother is the default, and this sampler its
+check. Bounds are not imposed here.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ from .gaussian import (
 from .kalman import GaussianFiltered
 
 FIRST_PASSES = 6
-"""Of the smoother before the first sweep; one before every later refresh."""
+"""Passes of the smoother before the first iteration; one before every later refresh."""
 
 DISPERSION = 2.0
-"""Times as far from the smoother's means as its own draws are where chains start."""
+"""Dispersion of the chains' starts about the smoother's means, relative to the smoother's draws."""
 
 STRIDES = (1.0, 0.5, 0.15)
-"""Of a sweep's moves of whole trajectories, as a share of the smoother's posterior; 1 is a fresh draw."""
+"""Sizes of moves of whole trajectories, as a share of the smoother's posterior; 1 is a fresh draw."""
 
 FROZEN = 0.01
 """Mobility below which a step counts as frozen."""
@@ -56,23 +56,23 @@ FROZEN = 0.01
 
 @shown_briefly
 class GibbsChain(NamedTuple):
-    """The reports, ``M`` draws of the truth, and how they moved.
+    """The observations, ``M`` draws of the truth, and their acceptance.
 
     Fields
     ------
     reported : Recording
     smoothed : TruthChain
-        The smoother's, about which chains start and move as a whole.
+        The smoother's chain, about which chains start and move as a whole.
     observations, actions : float ``[M, n, L, d]``, ``[M, n, L, k]``
     accepted : float ``[2, n, L]``
         Accepted proposals of each state and of each action since ``init``, over all chains.
     accepted_whole : float ``[n]``
-        Accepted moves of whole trajectories, likewise.
+        Accepted moves of whole trajectories since ``init``, over all chains.
     sweeps : int
-        Since ``init``.
+        Number of iterations since ``init``.
     mobility : float ``[n, L]``
-        Mean square by which the last refresh moved each step (over chains and components), in units of what
-        independent draws of the smoother's posterior would; NaN on padding and before the first refresh.
+        Mean square by which the last refresh moved each step (over chains and coordinates), in units of
+        independent draws of the smoother's posterior; NaN on padding and before the first refresh.
     """
 
     reported: Recording
@@ -86,12 +86,12 @@ class GibbsChain(NamedTuple):
 
     @property
     def acceptance(self) -> Float[Array, "2 n L"]:
-        """Share of the proposals of each state and action that was accepted; NaN on padding."""
+        """Share of accepted proposals of each state and action; NaN on padding."""
         return jnp.where(self.reported.live, self.accepted / (self.sweeps * len(self.observations)), jnp.nan)
 
     @property
     def acceptance_whole(self) -> Float[Array, " n"]:
-        """Share of the moves of each whole trajectory that was accepted."""
+        """Share of accepted moves of each whole trajectory."""
         return self.accepted_whole / (self.sweeps * len(self.observations) * len(STRIDES))
 
     @property
@@ -101,10 +101,10 @@ class GibbsChain(NamedTuple):
 
 
 class _Blanket(NamedTuple):
-    """What a state, or an action, depends on; leading axes ``N``.
+    """Markov blanket of a state or an action; leading axes ``N``.
 
-    ``first`` and ``followed`` say which terms there are: T1 of a first state is the Gaussian of ``s_0``, and
-    a last step has no T3.
+    ``first`` and ``followed`` mark the terms: T1 of a first state is the Gaussian of ``s_0``, and a last step
+    has no T3.
     """
 
     expected: Array
@@ -116,7 +116,7 @@ class _Blanket(NamedTuple):
 
 
 class _Tangent(NamedTuple):
-    """Value, next state, and the slope of the next state by the value."""
+    """Value, next state, and the slope of the next state in the value."""
 
     value: Array
     following: Array
@@ -137,7 +137,7 @@ def _inverse(covariance: Array) -> Array:
 
 
 def _pull_back(model: Model, blanket: _Blanket, at: _Tangent) -> tuple[Array, Array]:
-    """T3 as precision and information of the value."""
+    """Return T3 as precision and information of the value."""
     weight = _inverse(model.process_covariance)
     slope = jnp.where(blanket.followed[:, None, None], at.slope, 0.0)
     pulled = jnp.einsum("nji,jk->nik", slope, weight)
@@ -146,7 +146,7 @@ def _pull_back(model: Model, blanket: _Blanket, at: _Tangent) -> tuple[Array, Ar
 
 
 def _tangent_policy(policy: Any, observations: Float[Array, "N d"]) -> tuple[Array, Array, Array]:
-    """Mean ``[N, k]``, its derivative ``[N, k, d]`` and covariance ``[N, k, k]`` at each observation."""
+    """Return mean ``[N, k]``, its derivative ``[N, k, d]`` and covariance ``[N, k, k]`` at observations."""
     means, covariances = policy_moments(policy, observations)
     slopes = jax.vmap(jax.jacfwd(lambda s: policy_moments(policy, s)[0]))(observations)
     return means, slopes, covariances
@@ -155,7 +155,7 @@ def _tangent_policy(policy: Any, observations: Float[Array, "N d"]) -> tuple[Arr
 def _state_law(
     model: Model, policy: Any, sensor: GaussianSensor, blanket: _Blanket, at: _Tangent
 ) -> tuple[Array, Array]:
-    """Precision and information of a state: T1, T3, T4 and, through the slope of the policy, T2."""
+    """Return precision and information of a state: T1, T3, T4 and, through the policy's slope, T2."""
     mean, covariance = _law_of_start(model, blanket)
     prior, read = _inverse(covariance), _inverse(sensor.state_covariance)
     mu, K, sigma = _tangent_policy(policy, at.value)
@@ -170,7 +170,7 @@ def _state_law(
 def _action_law(
     model: Model, policy: Any, sensor: GaussianSensor, blanket: _Blanket, at: _Tangent
 ) -> tuple[Array, Array]:
-    """Precision and information of an action: T2, T3 and T5."""
+    """Return precision and information of an action: T2, T3 and T5."""
     mu, sigma = policy_moments(policy, blanket.other)
     prior, read = _inverse(sigma), _inverse(sensor.action_covariance)
     precision, information = _pull_back(model, blanket, at)
@@ -247,23 +247,23 @@ def _log_acceptance(
 
 @shown_briefly
 class GaussianGibbs(NamedTuple):
-    """``init(recording, sensor) -> chain``, ``refresh(chain, policy, key, sensor) -> (chain, truths)``.
+    """Gibbs sampler: ``init(recording, sensor) -> chain``, ``refresh(chain, policy, key, sensor)``.
 
-    A learner takes it where it takes a :class:`GaussianTruth`.
+    ``refresh`` returns ``(chain, truths)``. A learner accepts it in place of a :class:`GaussianTruth`.
 
     Fields
     ------
     truth : GaussianTruth
         Dynamics (with ``jacobians``), ``Q``, the law of ``s_0`` and the number of draws (chains, ``M``).
     sweeps : int
-        Of a refresh, after which the draws are the chains as they are.
+        Iterations of a refresh; the draws are the chains after them.
     """
 
     truth: GaussianTruth
     sweeps: int = 10
 
     def init(self, reported: Recording, sensor: GaussianSensor) -> GibbsChain:
-        """Start at the reports; the first refresh, which knows the policy, starts the chains.
+        """Start at the observations; the first refresh, which has the policy, starts the chains.
 
         Raises as :meth:`GaussianTruth.init` does.
         """
@@ -283,7 +283,7 @@ class GaussianGibbs(NamedTuple):
     def refresh(
         self, chain: GibbsChain, policy: Any, key: Array, sensor: GaussianSensor
     ) -> tuple[GibbsChain, Truths]:
-        """``sweeps`` sweeps: even states, odd states, actions, whole trajectories.
+        """Run ``sweeps`` iterations: even states, odd states, actions, whole trajectories.
 
         Warns of steps that hardly moved (:attr:`GibbsChain.mobility` below ``FROZEN``).
         """
@@ -349,7 +349,7 @@ def _move_whole(
     chain: GibbsChain,
     key: Array,
 ) -> GibbsChain:
-    """Move whole trajectories by steps of several strides, those that suit narrow and wide posteriors."""
+    """Move whole trajectories by several step sizes, for narrow and wide posteriors."""
     log_ratio = _log_exact_to_smoothed(truth, policy, sensor, filtered, chain)
     for stride, k in zip(STRIDES, jax.random.split(key, len(STRIDES)), strict=True):
         key_draw, key_accept = jax.random.split(k)
@@ -383,7 +383,7 @@ def _chosen(
 def _log_exact_to_smoothed(
     truth: GaussianTruth, policy: Any, sensor: GaussianSensor, filtered: GaussianFiltered, chain: GibbsChain
 ) -> Float[Array, "M n"]:
-    """Log-density of each chain's truth and the reports, less that of the truth under the smoother."""
+    """Return each chain's joint log-density of truth and observations, minus the smoother's of the truth."""
     s, a = chain.observations, chain.actions
     flat = _next(truth.dynamics, s.reshape(-1, s.shape[-1]), a.reshape(-1, a.shape[-1]))
     exact = log_joint(truth.model, policy, sensor, chain.reported, s, a, flat.reshape(s.shape))
@@ -406,7 +406,7 @@ def _sweep(
     return chain
 
 
-# A simulator is no part of a compiled function.
+# A simulator is not part of a compiled function.
 _compiled_sweep = jax.jit(_sweep, static_argnums=0)
 
 

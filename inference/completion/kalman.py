@@ -1,10 +1,10 @@
 """Exact inference in affine-Gaussian chains that change from step to step (Kalman 1960; Rauch et al. 1965).
 
-The chain is ``x_0 ~ N(m, P)``, ``x_{t+1} = F_t x_t + b_t + N(0, Q_t)``, read as ``y_t = H x_t + N(0, R_t)``.
-Covariances are sums of squares throughout (Joseph's form), which keeps them positive definite where ``Q_t``
-is nearly singular; what is inverted is inverted by Cholesky factors. 64-bit floats.
+The chain is ``x_0 ~ N(m, P)``, ``x_{t+1} = F_t x_t + b_t + N(0, Q_t)``, observed as
+``y_t = H x_t + N(0, R_t)``. Covariances are sums of squares throughout (Joseph's form), which keeps them
+positive definite if ``Q_t`` is nearly singular; inverses use Cholesky factors. 64-bit floats.
 
-Functions take one chain. ``jax.lax.map`` does several; ``jax.vmap`` would too, but batches of small
+Functions take one chain. Use ``jax.lax.map`` for several; ``jax.vmap`` works too, but batches of small
 factorisations inside a loop are slow on a CPU.
 """
 
@@ -28,7 +28,7 @@ class AffineGaussian(NamedTuple):
     Fields
     ------
     mean, covariance : float ``[D]``, ``[D, D]``
-        Of the first state.
+        Law of the first state.
     transition, offset, noise : float ``[L - 1, D, D]``, ``[L - 1, D]``, ``[L - 1, D, D]``
         ``F_t``, ``b_t`` and ``Q_t``.
     reading, reading_noise : float ``[m, D]``, ``[L, m, m]``
@@ -46,14 +46,15 @@ class AffineGaussian(NamedTuple):
 
 @shown_briefly
 class GaussianFiltered(NamedTuple):
-    """Forward pass, and the law of each state given the next: ``x_t | x_{t+1}, y_{0:t} ~
-    N(means_t + gains_t (x_{t+1} - predicted_{t+1}), conditional_t)``.
+    """Forward pass, and the law of each state given the next.
+
+    ``x_t | x_{t+1}, y_{0:t} ~ N(means_t + gains_t (x_{t+1} - predicted_{t+1}), conditional_t)``.
 
     Fields
     ------
     log_likelihood : float, in nats
     means, covariances : float ``[L, D]``, ``[L, D, D]``
-        Of ``x_t`` given ``y_{0:t}``.
+        Moments of ``x_t`` given ``y_{0:t}``.
     predicted : float ``[L - 1, D]``
         Mean of ``x_{t+1}`` given ``y_{0:t}``.
     gains, conditional : float ``[L - 1, D, D]``
@@ -69,7 +70,7 @@ class GaussianFiltered(NamedTuple):
 
 @shown_briefly
 class GaussianSmoothed(NamedTuple):
-    """Posterior of a chain given all readings.
+    """Posterior of a chain given all observations.
 
     Fields
     ------
@@ -92,7 +93,7 @@ def _symmetric(matrix: Array) -> Array:
 def filter_gaussian(
     chain: AffineGaussian, readings: Float[Array, "L m"], read: Bool[Array, " L"]
 ) -> GaussianFiltered:
-    """Forward pass; where ``read`` is false (padding, or a step not reported) there is no reading."""
+    """Run the forward pass; steps with ``read`` false (padding, hidden steps) have no observation."""
     identity = jnp.eye(chain.mean.shape[0])
     H = chain.reading
 
@@ -144,7 +145,7 @@ def filter_gaussian(
 
 
 def smooth_filtered(filtered: GaussianFiltered) -> GaussianSmoothed:
-    """Backward pass of Rauch, Tung and Striebel."""
+    """Run the backward pass of Rauch, Tung and Striebel."""
 
     def step(carry: tuple, inputs: tuple) -> tuple:
         following, spread = carry
@@ -168,12 +169,12 @@ def smooth_filtered(filtered: GaussianFiltered) -> GaussianSmoothed:
 def smooth_gaussian(
     chain: AffineGaussian, readings: Float[Array, "L m"], read: Bool[Array, " L"]
 ) -> GaussianSmoothed:
-    """Both passes; ``read`` as for :func:`filter_gaussian`."""
+    """Run both passes; ``read`` as for :func:`filter_gaussian`."""
     return smooth_filtered(filter_gaussian(chain, readings, read))
 
 
 def sample_filtered(key: Array, filtered: GaussianFiltered, draws: int) -> Float[Array, "draws L D"]:
-    """Independent joint draws of the whole chain given all readings, backwards from the last state."""
+    """Draw whole chains independently given all observations, backwards from the last state."""
     length, size = filtered.means.shape
     noise = jax.random.normal(key, (length, draws, size), filtered.means.dtype)
 
@@ -191,9 +192,9 @@ def sample_filtered(key: Array, filtered: GaussianFiltered, draws: int) -> Float
 def log_density_filtered(
     filtered: GaussianFiltered, states: Float[Array, "L D"], read: Bool[Array, " L"]
 ) -> Float[Array, ""]:
-    """Log-density of a chain given all readings, in nats, as :func:`sample_filtered` draws it.
+    """Return the log-density of a chain given all observations, in nats, as :func:`sample_filtered` draws it.
 
-    Only steps with a reading count: nothing must lead from them to the others, as on padding.
+    Only observed steps count: no transition may lead from them to the others, as on padding.
     """
 
     def step(following: Array, inputs: tuple) -> tuple:
@@ -213,6 +214,6 @@ def _log_normal(difference: Float[Array, " D"], covariance: Float[Array, "D D"])
 
 
 def _root(covariance: Float[Array, "D D"]) -> Float[Array, "D D"]:
-    """A Cholesky factor, of a covariance that rounding may have left a hair short of positive definite."""
+    """Return a Cholesky factor of a covariance that rounding may have left slightly indefinite."""
     slack = 1e-14 * jnp.trace(covariance) * jnp.eye(covariance.shape[0])
     return jnp.linalg.cholesky(covariance + slack)

@@ -1,15 +1,15 @@
 """The truth behind noisy recordings of continuous states and numbered actions: Technique 1 of section 6.2.3.
 
-Two ways to the same posterior, for sensors behind whose reports there are finitely many truths (mountain
-car's is behind two: the report, and the report shifted back).
+Two methods for the same posterior, for sensors with finitely many possible truths behind an observation
+(mountain car's has two: the observation, and the observation shifted back).
 
-:func:`partition_truth` is the dissertation's. The space is cut into ``Q`` parts a dimension; a cell's
+:func:`partition_truth` is the dissertation's. The space is cut into ``Q`` parts per dimension; a cell's
 transitions and policy are integrals over it, and the cells are smoothed exactly as any tabular process is
-(:mod:`~i2rl.models.laws.chain`). A draw then is one of the report's truths within the drawn cell. What is
-smaller than a cell is lost, and mountain car's shift is a tenth of one.
+(:mod:`~i2rl.models.laws.chain`). A draw is then one of the observation's truths within the drawn cell. Detail
+below the size of a cell is lost, and mountain car's shift is a tenth of one.
 
 :func:`candidate_truth`, the better one and the default, has no cells: the hidden state of a step *is* one of
-its report's truths, and moves between truths are weighed by the dynamics with a narrow Gaussian about them.
+its observation's truths, and transitions between truths have a narrow Gaussian about the dynamics.
 """
 
 from __future__ import annotations
@@ -37,12 +37,12 @@ DynamicsOfActions = Callable[[Array, Array], Array]
 
 @shown_briefly
 class CandidatePosterior(NamedTuple):
-    """Which of a report's truths it was.
+    """Posterior over the possible truths behind each observation.
 
     Fields
     ------
     log_likelihood : float ``[n]``
-        Of the reports, in nats (a density in what the dynamics leave open).
+        Log-likelihood of the observations, in nats (a density in the coordinates free under the dynamics).
     weights : float ``[n, L, K]``
         Posterior probability of each truth; zero on padding.
     """
@@ -59,7 +59,7 @@ class _Moves(NamedTuple):
 
 
 def _forward(chain: _Moves) -> Float[Array, "L K"]:
-    """``log p(candidate k at t, all before and at t)``."""
+    """Return ``log p(candidate k at t, all before and at t)``."""
 
     def step(alpha: Array, inputs: tuple) -> tuple:
         move, factor = inputs
@@ -82,7 +82,7 @@ def _backward(chain: _Moves) -> Float[Array, "L K"]:
 
 
 def _draw_candidates(key: Array, chain: _Moves, alpha: Float[Array, "L K"]) -> Array:
-    """One sequence ``[L]`` of the posterior, backwards."""
+    """Draw one sequence ``[L]`` of the posterior, backwards."""
     keys = jax.random.split(key, len(alpha))
     last = jax.random.categorical(keys[-1], alpha[-1])
 
@@ -97,13 +97,13 @@ def _draw_candidates(key: Array, chain: _Moves, alpha: Float[Array, "L K"]) -> A
 
 @shown_briefly
 class Box(NamedTuple):
-    """Where states can be, ``[d]`` each."""
+    """Box of possible states, ``[d]`` each."""
 
     low: Float[Array, " d"]
     high: Float[Array, " d"]
 
     def holds(self, states: Float[Array, "... d"]) -> Array:
-        """Whether states are inside; a millionth of the width is forgiven to 32-bit numbers."""
+        """Mark the states inside, within a millionth of the width for 32-bit numbers."""
         slack = 1e-6 * (self.high - self.low)
         return jnp.all((states >= self.low - slack) & (states <= self.high + slack), -1)
 
@@ -124,9 +124,9 @@ def _candidate_chains(
     actions = jnp.broadcast_to(reported.actions[..., None], factors.shape)
     expected = dynamics(places, actions)[:, :-1, :, None]
     z = (places[:, 1:, None] - expected) / scale
-    # Tails heavier than a Gaussian's, lest a recording that breaks the dynamics once be impossible.
+    # Tails heavier than a Gaussian's keep a recording possible that breaks the dynamics once.
     moves = jnp.logaddexp(-0.5 * jnp.sum(z**2, -1), jnp.log(1e-12) - jnp.sum(jnp.log1p(z**2), -1))
-    # Padding neither moves nor reports.
+    # Padding has neither transitions nor observations.
     moves = jnp.where(reported.followed[:, :-1, None, None], moves, 0.0)
     first = jnp.where(jnp.arange(factors.shape[-1]) == 0, 0.0, -jnp.inf)
     return _Moves(jnp.where(reported.live[..., None], factors, first), moves), places
@@ -155,9 +155,10 @@ def _candidate_draws(key: Array, chains: _Moves, places: Array, draws: int) -> F
 
 @shown_briefly
 class CandidateTruth(NamedTuple):
-    """``init(recording, sensor) -> chain``, ``refresh(chain, policy, key, sensor) -> (chain, truths)``.
+    """Smoothing over candidates: ``init(recording, sensor) -> chain``, ``refresh(...) -> (chain, truths)``.
 
-    Made by :func:`candidate_truth`. The posterior is exact at every call, so the chain is the recording.
+    Made by :func:`candidate_truth`. The arguments of ``refresh`` are ``(chain, policy, key, sensor)``. The
+    posterior is exact at every call, so the chain is the recording.
     """
 
     dynamics: DynamicsOfActions
@@ -166,10 +167,10 @@ class CandidateTruth(NamedTuple):
     draws: int
 
     def init(self, reported: Recording, sensor: FiniteSensor) -> Recording:
-        """The recording, if this can be its truth.
+        """Return the recording after checking that its truth exists.
 
-        Raises ``ValueError`` for other sizes, and naming trajectory and step where no truth behind the report
-        is in the space.
+        Raises ``ValueError`` for other sizes, and naming trajectory and step if every truth behind the
+        observation is outside the space.
         """
         _check(reported, sensor, self.box)
         return reported
@@ -177,13 +178,13 @@ class CandidateTruth(NamedTuple):
     def refresh(
         self, chain: Recording, policy: Any, key: Array, sensor: FiniteSensor
     ) -> tuple[Recording, Truths]:
-        """Independent joint draws."""
+        """Draw jointly and independently."""
         chains, places = _candidate_chains(self.dynamics, self.box, self.scale, policy, sensor, chain)
         drawn = _candidate_draws(key, chains, places, self.draws)
         return chain, truths(chain, drawn, jnp.broadcast_to(chain.actions, drawn.shape[:-1]))
 
     def posterior(self, chain: Recording, policy: Any, sensor: FiniteSensor) -> CandidatePosterior:
-        """Probability of each truth behind each report."""
+        """Return the probability of each truth behind each observation."""
         chains, _ = _candidate_chains(self.dynamics, self.box, self.scale, policy, sensor, chain)
         return _candidate_posterior(chains, chain.live)
 
@@ -196,13 +197,13 @@ def candidate_truth(
     precision: float = 1e-4,
     draws: int = 4,
 ) -> CandidateTruth:
-    """Smoothing over the truths that may be behind each report.
+    """Build smoothing over the possible truths behind each observation.
 
     Parameters
     ----------
     dynamics : function in JAX; next states after states and numbered actions
     low, high : ``[d]``
-        Bounds of the states; a truth outside is none.
+        Bounds of the states; truths outside are excluded.
     precision : float
         Deviation of the Gaussian about the dynamics, as a share of the width of the space.
     draws : int, ``M``
@@ -216,7 +217,7 @@ def candidate_truth(
 def fitted_shift_sensor(
     sensor: ShiftSensor, reported: Recording, posterior: CandidatePosterior
 ) -> ShiftSensor:
-    """The probability of a shift under which the reports are likeliest, given the posterior (the M-step)."""
+    """Fit the probability of a shift by maximum likelihood, given the posterior (the M-step)."""
     share = jnp.sum(posterior.weights[..., 1]) / jnp.sum(reported.live)
     return sensor._replace(probability=jnp.clip(share, 1e-6, 1 - 1e-6))
 
@@ -239,11 +240,11 @@ class Partition(NamedTuple):
     mdp: TabularMDP
 
     def cell(self, states: Float[Array, "... d"]) -> Array:
-        """Numbers of the cells that hold states, ``[...]``; states outside count to the nearest."""
+        """Return the indices of the cells of states, ``[...]``; states outside count to the nearest."""
         return _cells(self.box, round(self.mdp.n_states ** (1 / len(self.box.low))), states)
 
     def log_policy(self, policy: Any) -> Float[Array, "S A"]:
-        """Logarithm of the policy's mean over each cell (T2)."""
+        """Return the logarithm of the policy's mean over each cell (T2)."""
         return _log_mean_policy(policy, self.points)
 
 
@@ -272,9 +273,9 @@ def partition(
 ) -> Partition:
     """Cut a box into ``parts ** d`` cells and integrate the dynamics over each (T1 and T3).
 
-    ``points`` a cell (rounded to a full grid) stand for it, and ``policy_points`` where the policy is
-    averaged, which is smooth and asked for at every call. ``slack`` goes to the cells about those that are
-    reached, since a grid misses what is finer than itself.
+    ``points`` per cell (rounded to a full grid) represent it, and ``policy_points`` average the policy, which
+    is smooth and evaluated at every call. ``slack`` goes to the cells around the successors, since a grid
+    misses detail finer than itself.
     """
     box = _box(low, high)
     d = len(box.low)
@@ -313,38 +314,38 @@ def _grid(marks: Array, d: int) -> Float[Array, "N d"]:
 
 @shown_briefly
 class PartitionTruth(NamedTuple):
-    """The dissertation's Technique 1: as :class:`CandidateTruth`, by way of cells."""
+    """The dissertation's Technique 1: as :class:`CandidateTruth`, with cells."""
 
     partition: Partition
     draws: int = 4
 
     def init(self, reported: Recording, sensor: FiniteSensor) -> Recording:
-        """As :meth:`CandidateTruth.init`."""
+        """Check the recording as :meth:`CandidateTruth.init` does."""
         _check(reported, sensor, self.partition.box)
         return reported
 
     def factors(self, chain: Recording, policy: Any, sensor: FiniteSensor) -> Float[Array, "n L S A"]:
         """Multiply policy and evidence of each cell and action, in logarithms.
 
-        A report is as likely as the truths behind it that lie in the cell (T4 and T5; the density of a cell's
-        states being uniform, its constant is left out).
+        The likelihood of an observation in a cell is that of its truths in the cell (T4 and T5; the density
+        of a cell's states is uniform, and its constant is left out).
         """
         return _cell_factors(self.partition, policy, sensor, chain)[0]
 
     def cells(self, chain: Recording, policy: Any, sensor: FiniteSensor) -> Float[Array, "n L S"]:
-        """Posterior probability of each cell."""
+        """Return the posterior probability of each cell."""
         return _cell_posterior(self.partition, policy, sensor, chain)
 
     def refresh(
         self, chain: Recording, policy: Any, key: Array, sensor: FiniteSensor
     ) -> tuple[Recording, Truths]:
-        """Joint draws of cells, and in each of them a truth of the report."""
+        """Draw cells jointly, and in each of them a truth of the observation."""
         drawn = _drawn_places(key, self.partition, policy, sensor, chain, self.draws)
         return chain, truths(chain, drawn, jnp.broadcast_to(chain.actions, drawn.shape[:-1]))
 
 
 class _Behind(NamedTuple):
-    """The truths behind each report: where they are, in which cell, and how likely each makes it."""
+    """Truths behind each observation: positions, cells, and log-likelihoods of the observation."""
 
     places: Float[Array, "n L K d"]
     cells: Array
@@ -402,7 +403,7 @@ def partition_truth(
     points: int = 10_000,
     draws: int = 4,
 ) -> PartitionTruth:
-    """Smoothing over cells; parameters as of :func:`partition` and :func:`candidate_truth`."""
+    """Build smoothing over cells; parameters as for :func:`partition` and :func:`candidate_truth`."""
     if draws < 1:
         raise ValueError(f"draws must be at least 1, got {draws}")
     return PartitionTruth(partition(dynamics, low, high, n_actions, parts=parts, points=points), draws)

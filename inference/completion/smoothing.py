@@ -26,7 +26,7 @@ from ...models.process.mdp import TabularMDP
 
 @shown_briefly
 class Evidence(NamedTuple):
-    """A demonstration as a learner uses it: ``log e_t(s, a)`` as ``[n, L, S, A]`` and which steps exist."""
+    """A demonstration for a learner: ``log e_t(s, a)`` as ``[n, L, S, A]`` and marks of existing steps."""
 
     log_evidence: Float[Array, "n L S A"]
     live: Bool[Array, "n L"]
@@ -39,7 +39,7 @@ class Expectations(NamedTuple):
     Fields
     ------
     log_likelihood : float ``[n]``
-        Of each trajectory.
+        Log-likelihood of each trajectory.
     counts : float ``[S, A]``
         ``N(s, a)``, expected visits summed over trajectories and steps.
     features : float ``[K]``
@@ -69,19 +69,19 @@ def evidence_of(mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration
 
 
 def smooth_all(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Smoothed:
-    """Forward-backward over every trajectory; fields as in :class:`Smoothed` with a leading ``n``."""
+    """Run forward-backward passes over every trajectory; fields of :class:`Smoothed` with a leading ``n``."""
     return chain.smooth_all(mdp, evidence.log_evidence + log_policy, evidence.live)
 
 
 def log_likelihoods(
     mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence
 ) -> Float[Array, " n"]:
-    """Exact log-likelihood of each trajectory."""
+    """Return the exact log-likelihood of each trajectory."""
     return filter_all(mdp, evidence.log_evidence + log_policy, evidence.live).log_likelihood
 
 
 def expectations(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Expectations:
-    """The exact E-step (Eq. 4.1 with the sum over completions carried out)."""
+    """Run the exact E-step (Eq. 4.1 with the sum over completions carried out)."""
     return collect(mdp, smooth_all(mdp, log_policy, evidence), evidence.live)
 
 
@@ -105,7 +105,7 @@ def collect(mdp: TabularMDP, posterior: Smoothed, live: Bool[Array, "n L"]) -> E
 def sample_completions(
     key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, draws: int
 ) -> tuple[Int[Array, "draws n L"], Int[Array, "draws n L"]]:
-    """Independent joint completions (states, actions) by backward sampling; -1 on padding."""
+    """Draw independent joint completions (states, actions) by backward sampling; -1 on padding."""
 
     factors = evidence.log_evidence + log_policy
 
@@ -121,7 +121,7 @@ def sample_completions(
 def blocked_posterior(
     key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, draws: int
 ) -> Smoothed:
-    """:func:`smooth_all` estimated from ``draws`` independent joint completions of each trajectory."""
+    """Estimate :func:`smooth_all` from ``draws`` independent joint completions of each trajectory."""
     states, actions = sample_completions(key, mdp, log_policy, evidence, draws)
     return _average(mdp, log_policy, evidence, states, actions)
 
@@ -134,7 +134,7 @@ def gibbs_posterior(
     draws: int,
     burn_in: int = 20,
 ) -> Smoothed:
-    """:func:`smooth_all` estimated by ``draws`` sweeps of the single-site Gibbs sampler."""
+    """Estimate :func:`smooth_all` from ``draws`` of the single-site Gibbs sampler."""
     states, actions = gibbs_completions(key, mdp, log_policy, evidence, draws, burn_in)
     return _average(mdp, log_policy, evidence, states, actions)
 
@@ -142,7 +142,7 @@ def gibbs_posterior(
 def blocked_expectations(
     key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, draws: int
 ) -> Expectations:
-    """:func:`expectations` estimated from ``draws`` independent joint completions."""
+    """Estimate :func:`expectations` from ``draws`` independent joint completions."""
     return collect(mdp, blocked_posterior(key, mdp, log_policy, evidence, draws), evidence.live)
 
 
@@ -154,12 +154,12 @@ def gibbs_expectations(
     draws: int,
     burn_in: int = 20,
 ) -> Expectations:
-    """:func:`expectations` estimated by ``draws`` sweeps of the single-site Gibbs sampler."""
+    """Estimate :func:`expectations` from ``draws`` of the single-site Gibbs sampler."""
     return collect(mdp, gibbs_posterior(key, mdp, log_policy, evidence, draws, burn_in), evidence.live)
 
 
 class _SingleSite(NamedTuple):
-    """The single-site sampler of one trajectory: a pair ``(states, actions)`` to start from, and a sweep."""
+    """Single-site sampler of one trajectory: an initial pair ``(states, actions)``, and one iteration."""
 
     start: Callable[[Array], tuple[Array, Array]]
     sweep: Callable[[tuple[Array, Array], Array], tuple[Array, Array]]
@@ -207,12 +207,13 @@ def gibbs_completions(
     draws: int,
     burn_in: int = 20,
 ) -> tuple[Int[Array, "draws n L"], Int[Array, "draws n L"]]:
-    """Completions by single-site Gibbs: a sweep redraws every state, then its action, given both neighbours.
+    """Draw completions by single-site Gibbs: an iteration redraws every state, then its action.
 
-    The dissertation's MCMC. Unlike its released code, the look-ahead factor ``P(s_{t+1} | s_t, a_t)``
-    enters at every step. Where the dynamics are nearly deterministic a single site cannot move, so it
-    mixes poorly or not at all: an inherent limit of the sampler, and why it is not the default. The chain
-    starts from a completion drawn under the uniform policy over the actions that ``log_policy`` may take.
+    It is the dissertation's MCMC; each redraw is given both neighbours. Unlike in its released code, the
+    look-ahead factor ``P(s_{t+1} | s_t, a_t)`` enters at every step. If the dynamics are nearly deterministic
+    a single site cannot move, so the sampler mixes poorly or not at all. This is an inherent limit, and the
+    reason that it is not the default. The chain starts from a completion drawn under the uniform policy over
+    the actions that ``log_policy`` may take.
     """
 
     def chain(key: Array, e: Array, live: Array) -> tuple:
@@ -238,7 +239,7 @@ class Settled(NamedTuple):
     Fields
     ------
     states, actions : int ``[draws, n, L]``
-        Those from ``drawn`` on were not drawn.
+        Entries from ``drawn`` on were not drawn.
     drawn : int
     """
 
@@ -257,10 +258,10 @@ def settled_completions(
     score: Callable[[Int[Array, "n L"], Int[Array, "n L"]], Float[Array, "n L"]],
     change: ArrayLike,
 ) -> Settled:
-    """The first of :func:`gibbs_completions`, until one more hardly moves the average of ``score``.
+    """Draw the first of :func:`gibbs_completions`, until one more hardly moves the average of ``score``.
 
-    Lines 6-15 of Algorithm 3: drawing ends where the running average over completions moves by at most
-    ``change``, the mean of its absolute changes over the steps that exist; otherwise after ``draws``. The
+    Lines 6-15 of Algorithm 3: drawing ends when the running average over completions moves by at most
+    ``change``, the mean of its absolute changes over the existing steps; otherwise after ``draws``. The
     algorithm as printed compares an average with itself; here it is compared with the one before.
     """
     n, length = evidence.live.shape

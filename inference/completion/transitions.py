@@ -1,8 +1,8 @@
-"""What an expert did, as weights on transitions ``(s, a, s')``, given reports that hide, err or both.
+"""An expert's behaviour as weights on transitions ``(s, a, s')``, given hidden or noisy observations.
 
-Transitions are kept as successor lists ``[S, A, B]``, never as a dense ``[S, A, S]``. Three ways from reports
-to transitions: their exact posterior under a policy, an estimate of it by single-site Gibbs sampling (section
-6.2.3), and the reports at face value.
+Transitions are stored as successor lists ``[S, A, B]``, never as a dense ``[S, A, S]``. Three methods lead
+from observations to transitions: their exact posterior under a policy, an estimate of it by single-site Gibbs
+sampling (section 6.2.3), and the observations at face value.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ class Completed(NamedTuple):
     Fields
     ------
     log_likelihood : float ``[n]``
-        Of each trajectory, nats.
+        Log-likelihood of each trajectory, nats.
     steps : float ``[n, L, S, A, U]``
-        Distribution of each step over ``(s, a, s')``, by successor lists; zero where there is none.
+        Distribution of each step over ``(s, a, s')``, by successor lists; zero for absent steps.
     starts : float ``[H, S]``
-        How many stretches of behaviour began in each state and were still being followed ``t`` steps later.
+        Number of stretches of behaviour that began in each state and were still followed ``t`` steps later.
     """
 
     log_likelihood: Float[Array, " n"]
@@ -62,20 +62,20 @@ class TransitionStatistic(NamedTuple):
 
 
 def summarised(completed: Completed) -> TransitionStatistic:
-    """The statistic of one session."""
+    """Summarise one session in a statistic."""
     weights = jnp.sum(completed.steps, axis=(0, 1))
     size = jnp.sum(weights)
     share = 1 / jnp.maximum(size, 1e-300)
     return TransitionStatistic(size, weights * share, completed.starts * share)
 
 
-# -- three ways from reports to transitions -----------------------------------------------------------
+# -- three methods from observations to transitions -----------------------------------------------------
 
 
 def exact_transitions(
     mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, horizon: int
 ) -> Completed:
-    """The posterior of every transition given all reports, hidden steps and errors summed out."""
+    """Return the posterior of every transition given all observations, hidden steps and noise summed out."""
     log_likelihood, steps = smooth_transitions_all(mdp, evidence.log_evidence + log_policy, evidence.live)
     return Completed(log_likelihood, steps, _starts(steps, evidence.live, horizon))
 
@@ -97,10 +97,10 @@ def gibbs_transitions(
     burn_in: int,
     settling: Settling | None = None,
 ) -> Completed:
-    """The same estimated from ``draws`` sweeps of the single-site sampler (Eq. 6.10, lines 6-15).
+    """Estimate the same from ``draws`` of the single-site sampler (Eq. 6.10, lines 6-15).
 
-    After the last step the successor is distributed as the dynamics have it. With ``settling``, from no
-    more sweeps than the average logit takes to move by at most ``settling.change``
+    After the last step the successor follows the dynamics. With ``settling``, drawing stops when the average
+    logit moves by at most ``settling.change``
     (:func:`~i2rl.inference.completion.smoothing.settled_completions`).
     """
     n, length = evidence.live.shape
@@ -141,11 +141,11 @@ def reported_transitions(
     demonstration: Demonstration,
     horizon: int,
 ) -> Completed:
-    """The reports taken for the truth; steps that were not seen, or seen in part, are left out.
+    """Take the observations for the truth; leave out steps that were hidden, even in part.
 
-    So are reports of actions that do not exist. ``successors`` are those of :func:`wide_successors`. Where
-    the next report names no state that could follow, or there is none, the successor is distributed as the
-    dynamics have it. The log-likelihood is that of the reported actions, given the reported states.
+    Observations of unavailable actions are left out too. ``successors`` are those of :func:`wide_successors`.
+    If the next observation is not a possible successor, or there is none, the successor follows the dynamics.
+    The log-likelihood is that of the observed actions, given the observed states.
     """
     kind, state, action = (jnp.asarray(x) for x in demonstration.arrays[:3])
     s, a = jnp.maximum(state, 0), jnp.maximum(action, 0)
@@ -180,9 +180,9 @@ def reported_transitions(
 
 
 def wide_successors(mdp: TabularMDP) -> Int[np.ndarray, "S A U"]:
-    """Successor lists of pairs, lengthened by the states that other actions lead to from the same state.
+    """Lengthen successor lists by the states that other actions lead to from the same state.
 
-    A wrong report of the action leaves the next state as it was.
+    A wrongly observed action leaves the next state unchanged.
     """
     own, possible = np.asarray(mdp.successors), np.asarray(mdp.probabilities) > 0
     more = [np.unique(own[s][possible[s]]) for s in range(mdp.n_states)]
@@ -195,7 +195,7 @@ def wide_successors(mdp: TabularMDP) -> Int[np.ndarray, "S A U"]:
 def _landed(
     successors: Int[Array, "S A U"], states: Int[Array, "... L"], actions: Int[Array, "... L"]
 ) -> Bool[Array, "... L U"]:
-    """Which entries of the lists name the state of the next step."""
+    """Mark the entries of the lists that equal the state of the next step."""
     following = jnp.roll(states, -1, axis=-1)
     return successors[states, actions] == following[..., None]
 
@@ -206,15 +206,15 @@ def _starts(steps: Float[Array, "n L S A U"], live: Bool[Array, "n L"], horizon:
     return (jnp.arange(horizon)[:, None] < lengths).astype(float) @ first
 
 
-# -- what a policy does -------------------------------------------------------------------------------
+# -- transitions of a policy ----------------------------------------------------------------------------
 
 
 def visited_transitions(
     mdp: TabularMDP, log_policy: Float[Array, "S A"], starts: Float[Array, "H S"]
 ) -> Float[Array, "S A B"]:
-    """Shares of transitions of a policy begun where the expert was, for as long as the expert was followed.
+    """Return shares of a policy's transitions from the expert's first states, over the expert's lengths.
 
-    Exact. ``sum_t P_pi^t starts_t``, by Horner's rule.
+    The shares are exact: ``sum_t P_pi^t starts_t``, by Horner's rule.
     """
     policy = jnp.exp(log_policy)
 
@@ -228,7 +228,7 @@ def visited_transitions(
 def discounted_transitions(
     mdp: TabularMDP, log_policy: Float[Array, "S A"], starts: Float[Array, "H S"]
 ) -> Float[Array, "S A B"]:
-    """Shares of transitions in the discounted occupancy of a policy from ``p0``, wherever the expert was."""
+    """Return shares of transitions in the discounted occupancy of a policy from ``p0``; ignore ``starts``."""
     del starts
     return _shares(mdp, occupancy(mdp, jnp.exp(log_policy)))
 

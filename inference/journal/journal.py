@@ -1,26 +1,26 @@
 """Durable sessions: every session of a learner committed whole to an SQLite file, or not at all.
 
-What is promised. When :meth:`Journal.commit` returns, the session's report, the learner's state and how much
-of the input it had consumed are on disk together; a process killed at any instant, or a machine that loses
-power, leaves the last committed session, never part of one. The file keeps every session's report and
-weights but only the newest state, so it grows by one report a session.
+Guarantees. When :meth:`Journal.commit` returns, the session's info, the learner's state and the consumed part
+of the input are on disk together; a process killed at any instant, or a machine that loses power, leaves the
+last committed session, never part of one. The file holds every session's info and weights but only the newest
+state, so it grows by one info per session.
 
-How. SQLite in write-ahead-log mode with ``synchronous=FULL``. The log was chosen over the rollback journal
-because a person may look (:meth:`Journal.read`) while a learner writes without either waiting for the other,
-and because a commit is one flush to the disk.
-The log's price is shared memory between readers and the writer: keep a journal on a local disk, not a network
-one, and while it is open (or after a kill) move it together with its ``-wal`` file. A closed journal is one
-ordinary file. One writer at a time: it holds a lock on ``<path>-lock``, which the system releases when the
-process ends, however it ends; the empty lock file stays behind.
+Storage. SQLite in write-ahead-log mode with ``synchronous=FULL``. The log was chosen over the rollback
+journal for two reasons: a person may read (:meth:`Journal.read`) while a learner writes, without either
+waiting for the other, and a commit is one flush to the disk. The log needs shared memory between readers and
+the writer: put a journal on a local disk, not a network one, and while it is open (or after a kill) move it
+together with its ``-wal`` file. A closed journal is one ordinary file. There is one writer at a time: it
+holds a lock on ``<path>-lock``, which the system releases when the process ends; the empty lock file stays
+behind.
 
-How damage is noticed. Every session holds a digest of itself and of the session before it, the first one of
-the journal's origin; the state holds the newest digest and the number of sessions. Opening compares the
-state, the number of sessions and the newest of them (for writing the newest 1,000). Reading a session
-compares it with those beside it, and :meth:`JournalView.verify` compares everything. The digests are no
-signatures: they reveal accidents, and not somebody who computes them anew.
+Damage. Every session holds a digest of itself and of the session before it, the first one of the journal's
+origin; the state holds the newest digest and the number of sessions. Opening compares the state, the number
+of sessions and the newest of them (for writing the newest 1,000). Reading a session compares it with those
+beside it, and :meth:`JournalView.verify` compares everything. The digests are not signatures: they reveal
+accidents, not forgery.
 
-Versions. Journals of version 1 have no digests. :meth:`Journal.open` adds them, taking what is there as true;
-:meth:`Journal.read` shows such a journal unverified.
+Versions. Journals of version 1 have no digests. :meth:`Journal.open` adds them, trusting the content;
+:meth:`Journal.read` reads such a journal unverified.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ __all__ = ["Journal", "JournalBusy", "JournalError", "JournalView", "Origin", "P
 APPLICATION_ID = int.from_bytes(b"i2rl", "big")
 SCHEMA_VERSION = 2
 SESSION_BYTES = 1 << 26
-"""The most that weights, report or origin may take: nothing larger is read into memory, or written."""
+"""Limit of the bytes of weights, info or origin: nothing larger is read into memory, or written."""
 
 RECENT = 1000
 """Sessions that are compared with their digests when a journal is opened for writing."""
@@ -100,11 +100,11 @@ ALTER TABLE session ADD COLUMN chain BLOB NOT NULL DEFAULT x'';
 """
 
 
-# -- what is kept ---------------------------------------------------------------------------------------
+# -- records --------------------------------------------------------------------------------------------
 
 
 class Position(NamedTuple):
-    """How much of the input a learner has consumed.
+    """Part of the input that a learner has consumed.
 
     Fields
     ------
@@ -118,7 +118,7 @@ class Position(NamedTuple):
     digest: str = ""
 
     def after(self, line: str) -> Position:
-        """The position once one more line is consumed."""
+        """Return the position after one more line."""
         content = bytes.fromhex(self.digest) + line.rstrip("\r\n").encode("utf-8", "surrogatepass")
         return Position(self.records + 1, hashlib.sha256(content).hexdigest())
 
@@ -132,16 +132,16 @@ class SessionRecord(NamedTuple):
     session : int
         Its number.
     committed : float
-        When, in seconds since 1970 (UTC).
+        Time in seconds since 1970 (UTC).
     weights : float array
         The learner's weights after it, in the learner's own shape (``[K]`` for one reward).
     report : dict
-        The report's fields by name (nested ones as ``outer.inner``), as NumPy values, text or None; a random
+        The info's fields by name (nested ones as ``outer.inner``), as NumPy values, text or None; a random
         key as its key data.
     position : Position
-        The input consumed by then.
+        The input consumed until then.
     demonstration : bytes
-        Digest of what it learned from (:func:`~i2rl.inference.sessions.serialization.demonstration_digest`);
+        Digest of its demonstration (:func:`~i2rl.inference.sessions.serialization.demonstration_digest`);
         empty if unknown.
     """
 
@@ -154,7 +154,7 @@ class SessionRecord(NamedTuple):
 
 
 class Origin(NamedTuple):
-    """What a journal was made for: an MDP, a method and its configuration."""
+    """Origin of a journal: an MDP, a method and its configuration."""
 
     method: str
     configuration: dict[str, Any]
@@ -166,10 +166,10 @@ class Origin(NamedTuple):
 
     @staticmethod
     def of(learner: Learner) -> Origin:
-        """The origin a journal of this learner has."""
+        """Return the origin of a journal of this learner."""
         return Origin(
             method=str(learner.name),
-            # Through JSON, so that it equals what is read back.
+            # Through JSON, so that it equals the origin read back.
             configuration=json.loads(
                 json.dumps(dict(getattr(learner, "configuration", {})), default=_jsonable)
             ),
@@ -182,7 +182,7 @@ class Origin(NamedTuple):
 
     @staticmethod
     def parsed(content: str) -> Origin:
-        """The origin in JSON. Raises ``ValueError`` naming what is not as it should be."""
+        """Parse the origin from JSON. Raises ``ValueError`` naming an invalid part."""
         try:
             fields = json.loads(content)
         except (ValueError, RecursionError):
@@ -207,7 +207,7 @@ class Origin(NamedTuple):
         )
 
     def difference(self, other: Origin) -> str:
-        """In words, what of ``other`` is not as here; empty if nothing."""
+        """Describe the differences of ``other`` in words; empty if there are none."""
         if self.signature == other.signature and self.fingerprint == other.fingerprint:
             return ""
         parts = [
@@ -241,7 +241,7 @@ def _jsonable(value: object) -> object:
 
 
 class _Row(NamedTuple):
-    """A session as it is stored."""
+    """Stored row of a session."""
 
     number: int
     committed: float
@@ -258,7 +258,7 @@ class _Row(NamedTuple):
         return Position(self.records, self.digest)
 
     def linked(self, genesis: bytes, previous: bytes) -> bytes:
-        """The digest that ``chain`` should be, after a session whose digest is ``previous``."""
+        """Return the digest that ``chain`` should be, after a session whose digest is ``previous``."""
         digest = hashlib.blake2b(genesis + previous, digest_size=32)
         numbers = struct.pack("<qdq", self.number, self.committed, self.records)
         texts = (self.digest.encode("utf-8", "surrogatepass"), self.demonstration, self.state)
@@ -268,12 +268,18 @@ class _Row(NamedTuple):
         return digest.digest()
 
 
-# Type, and the most bytes of a blob. A value of another type or size is not read: NULL comes in its place.
+# Type, and the most bytes of a blob. A value of another type or size is replaced by NULL.
 _COLUMNS: dict[str, tuple[str, int]] = {
-    "number": ("integer", 0), "committed": ("real", 0), "records": ("integer", 0), "digest": ("text", 0),
-    "demonstration": ("blob", 64), "state": ("blob", 64), "chain": ("blob", 64),
-    "weights": ("blob", SESSION_BYTES), "report": ("blob", SESSION_BYTES),
-}  # fmt: skip
+    "number": ("integer", 0),
+    "committed": ("real", 0),
+    "records": ("integer", 0),
+    "digest": ("text", 0),
+    "demonstration": ("blob", 64),
+    "state": ("blob", 64),
+    "chain": ("blob", 64),
+    "weights": ("blob", SESSION_BYTES),
+    "report": ("blob", SESSION_BYTES),
+}
 
 
 def _selected(columns: Iterable[str], absent: Sequence[str] = ()) -> str:
@@ -286,7 +292,7 @@ def _selected(columns: Iterable[str], absent: Sequence[str] = ()) -> str:
 
 
 def _stamp(tree: bytes) -> bytes:
-    """What a session keeps of the state it led to: the size of its bytes, and their own digest."""
+    """Return the size and the digest of the state after a session."""
     return struct.pack("<Q", len(tree)) + tree[-DIGEST_SIZE:]
 
 
@@ -294,16 +300,16 @@ def _stamp(tree: bytes) -> bytes:
 
 
 class JournalView:
-    """A journal as it stands, for looking at; from :meth:`Journal.read`.
+    """A journal open for reading; from :meth:`Journal.read`.
 
     Every call reads one consistent moment and takes no lock that a writer waits for, so a view of a running
     learner's journal shows more sessions as they are committed. Close it, or use it as a context manager.
-    One thread at a time.
+    Use it in one thread at a time.
 
     Attributes
     ----------
     lacks_log : bool
-        Whether the file was moved or copied without its ``-wal`` while a learner had it open or after a kill,
+        True if the file was moved or copied without its ``-wal`` while a learner had it open or after a kill,
         so that sessions may be missing.
     """
 
@@ -313,7 +319,7 @@ class JournalView:
         self.path = path
         self._connection = connection
         self._in_use = in_use
-        # SQLite then refuses a longer text before it is read; a state may be longer, and says so itself.
+        # SQLite then refuses a longer text before it is read; a longer state raises its own error.
         connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2 * SESSION_BYTES)
         self._version = self._select("PRAGMA user_version")[0][0]
         content = self._single("SELECT iif(typeof(content) = 'text', content, NULL) FROM origin", "origin")[0]
@@ -335,9 +341,9 @@ class JournalView:
         return self.position_after(self.session) or Position()
 
     def records(self, last: int | None = None) -> Iterator[SessionRecord]:
-        """Committed sessions, in order: all of them, or the ``last`` few, of which no others are read.
+        """Yield committed sessions in order: all of them, or only the ``last`` few.
 
-        Raises :class:`JournalError` naming one that is damaged, or between which two something is missing.
+        Raises :class:`JournalError` naming a damaged session, or two sessions with a gap between them.
         """
         if last is not None and not (isinstance(last, int) and 0 < last < 2**63):
             raise ValueError(f"`last` must be a positive number of sessions; got {shortened(last)}")
@@ -346,37 +352,37 @@ class JournalView:
 
     @property
     def sessions(self) -> int:
-        """How many sessions are there: less than :attr:`session` where one could not be committed."""
+        """Number of stored sessions: less than :attr:`session` if one could not be committed."""
         return self._state().sessions
 
     def position_after(self, session: int) -> Position | None:
-        """The input consumed by a session; None if there is no such session."""
+        """Return the input consumed by a session; None if there is no such session."""
         found = self._rows("WHERE number = ?", session)
         return found[0].position if found else None
 
     def demonstration(self, session: int) -> bytes:
-        """Digest of what a session learned from; empty if unknown, or if there is no such session."""
+        """Return the digest of a session's demonstration; empty if unknown or if there is no such session."""
         found = self._rows("WHERE number = ?", session)
         return found[0].demonstration if found else b""
 
     def learned_from(self, demonstration: bytes) -> int | None:
-        """The first session that learned from a demonstration with this digest; None if there is none."""
+        """Return the first session of a demonstration with this digest; None if there is none."""
         if self._version < 2:
             return None
         query = "SELECT min(number) FROM session WHERE demonstration = ?"
         return self._select(query, demonstration)[0][0]
 
     def stored_state(self) -> dict[str, Any]:
-        """The newest state's leaves by name (as in :attr:`SessionRecord.report`); empty before the first."""
+        """Return the newest state's leaves by name (see :attr:`SessionRecord.report`); empty at first."""
         try:
             return {name: leaf.plain for name, leaf in self._state_leaves().items()}
         except ValueError as error:
             raise self._damaged(f"its state cannot be read: {error}") from None
 
     def verify(self) -> int:
-        """Compare everything with its digest, and check the file's structure; return the sessions found.
+        """Compare everything with its digest, and check the file's structure; return the number of sessions.
 
-        Raises :class:`JournalError` naming the first thing that is damaged.
+        Raises :class:`JournalError` naming the first damaged part.
         """
         found = self._select("PRAGMA quick_check(1)")[0][0]
         if found != "ok":
@@ -386,19 +392,19 @@ class JournalView:
         return sessions
 
     def to_inference_data(self) -> arviz.InferenceData:
-        """The sessions as ArviZ ``InferenceData`` with one group, ``sessions``.
+        """Convert the sessions to ArviZ ``InferenceData`` with one group, ``sessions``.
 
-        Weights are point estimates, one a session, and not draws from anything, so they are no ``posterior``.
-        The group holds ``weights`` (session, feature), each field of the report (one that is called
+        Weights are point estimates, one per session, not posterior draws, so there is no group ``posterior``.
+        The group holds ``weights`` (session, feature), each field of the info (a field called
         ``weights``, ``committed`` or ``records`` is prefixed ``report_``), ``committed`` (UTC) and
-        ``records``. Where shapes change from session to session, or a value is None, NaN fills the rest.
+        ``records``. If shapes change from session to session, or a value is None, NaN fills the rest.
         """
         import arviz
 
         return arviz.InferenceData(sessions=_dataset(list(self.records()), self.origin))
 
     def to_netcdf(self, filename: str | os.PathLike[str]) -> None:
-        """Write :meth:`to_inference_data` as NetCDF, to be read by ``arviz.from_netcdf``.
+        """Write :meth:`to_inference_data` as NetCDF, for ``arviz.from_netcdf``.
 
         Raises ``ValueError`` for a file of the journal itself.
         """
@@ -439,7 +445,7 @@ class JournalView:
             yield
 
     def _rows(self, which: str, *values: object) -> list[_Row]:
-        """Sessions, of the right types. Raises :class:`JournalError` naming one that has others."""
+        """Read sessions of the right types. Raises :class:`JournalError` naming one with others."""
         absent = ("demonstration", "state", "chain") if self._version < 2 else ()
         rows = self._select(f"SELECT {_selected(_COLUMNS, absent)} FROM session {which}", *values)
         for values in rows:
@@ -452,7 +458,7 @@ class JournalView:
         return [_Row(*values) for values in rows]
 
     def _verified(self, last: int | None) -> Iterator[_Row]:
-        """Sessions in order, each compared with the one before it, and the newest with the state."""
+        """Yield sessions in order, each compared with the one before it, and the newest with the state."""
         before, chain = 0, self._genesis
         if last is not None:
             for row in self._rows("ORDER BY number DESC LIMIT 1 OFFSET ?", last):
@@ -466,7 +472,7 @@ class JournalView:
                 return
             row = rows[0]
             if self._version > 1 and row.linked(self._genesis, chain) != row.chain:
-                self._record(row)  # which says so if its own bytes are damaged
+                self._record(row)  # raises first if the row's own bytes are damaged
                 after = f"session {before}" if before else "the journal's beginning"
                 raise self._damaged(
                     f"session {row.number} does not follow {after}: one of them was changed, or one between "
@@ -488,7 +494,7 @@ class JournalView:
         )
 
     def _state(self) -> _Newest:
-        """What the state says of the sessions."""
+        """Read the state's summary of the sessions."""
         if self._version < 2:
             rows = self._select("SELECT session, (SELECT count(*) FROM session) FROM state")
             return _Newest(rows[0][0], rows[0][1], b"") if rows else _Newest(0, 0, b"")
@@ -538,7 +544,7 @@ class JournalView:
 
     @contextmanager
     def _any_length(self) -> Iterator[None]:
-        """Let SQLite read or write a value that is longer than a session's may be: a state."""
+        """Let SQLite read or write a state, which may be longer than a session."""
         before = self._connection.setlimit(sqlite3.SQLITE_LIMIT_LENGTH, 2**31 - 1)
         try:
             yield
@@ -547,7 +553,7 @@ class JournalView:
 
 
 class _Newest(NamedTuple):
-    """After which session a state is, how many there are by then, and the digest of the last."""
+    """Summary in the state: its session, the number of sessions, and the digest of the last."""
 
     session: int
     sessions: int
@@ -573,10 +579,10 @@ class Journal(JournalView):
 
     @staticmethod
     def open(path: str | os.PathLike[str], learner: Learner) -> Journal:
-        """Open the journal of this learner, making the file if there is none.
+        """Open the journal of this learner; create the file if there is none.
 
-        Raises :class:`JournalBusy` where another writer has it open, and :class:`JournalError` where the file
-        is no journal (it is left as it was), was made by a newer version, belongs to another MDP, method or
+        Raises :class:`JournalBusy` if another writer has it open, and :class:`JournalError` if the file is
+        not a journal (it stays unchanged), was made by a newer version, belongs to another MDP, method or
         configuration, is damaged, or cannot be read or written.
         """
         if not hasattr(learner, "signature"):
@@ -593,7 +599,7 @@ class Journal(JournalView):
                 connection = connect(path, "rw")
                 opened.callback(connection.close)
                 connection.execute("PRAGMA synchronous=FULL")
-                connection.execute("PRAGMA fullfsync=ON")  # macOS: its plain flush stops short of the disk
+                connection.execute("PRAGMA fullfsync=ON")  # macOS: its plain flush does not reach the disk
                 origin = Origin.of(learner)
                 if _is_empty(connection):
                     _create(connection, origin)
@@ -607,7 +613,7 @@ class Journal(JournalView):
                 for _ in view._verified(last=RECENT):
                     pass
                 state = _restored_state(view, learner)
-                # Not before here, so that a journal that is refused stays as it was.
+                # Only here, so that a refused journal stays unchanged.
                 _require_alone(connection, lock)
                 if view._version < SCHEMA_VERSION:
                     _migrate(view)
@@ -623,9 +629,9 @@ class Journal(JournalView):
 
     @staticmethod
     def read(path: str | os.PathLike[str]) -> JournalView:
-        """Open a journal for looking at, also while a writer runs and without knowing its learner.
+        """Open a journal for reading, also while a writer runs and without its learner.
 
-        Raises :class:`JournalError` where there is no journal, it was made by a newer version, or is damaged.
+        Raises :class:`JournalError` if there is no journal, it was made by a newer version, or is damaged.
         """
         path = journal_files(path)[0]
         if not path.exists():
@@ -635,7 +641,7 @@ class Journal(JournalView):
             lacks_log = _lacks_log(path)
             in_use = InUse(path)
             opened.callback(in_use.release)
-            # Not opened read-only: what a killed writer left half done is then undone before it is read.
+            # Writable, so that SQLite can first undo what a killed writer left half done.
             connection = connect(path, "rw")
             opened.callback(connection.close)
             connection.execute("PRAGMA query_only=ON")
@@ -652,28 +658,28 @@ class Journal(JournalView):
     def commit(
         self, state: Any, report: Any, position: Position | None = None, demonstration: bytes = b""
     ) -> None:
-        """Commit one session: durable, all of it, when this returns.
+        """Commit one session: all of it is durable when this returns.
 
         Parameters
         ----------
         state : NamedTuple
             The learner's state after the session, with ``weights`` and the session's number in ``session``.
         report : NamedTuple
-            The session's report.
+            The session's info.
         position : Position, optional
-            The input consumed so far; by default what it was.
+            The input consumed so far; by default unchanged.
         demonstration : bytes, optional
-            Digest of what the session learned from, by which it is recognised later.
+            Digest of the session's demonstration, which identifies it later.
 
         Raises
         ------
         ValueError
-            The session is already committed: its number is not above :attr:`session`. Or its weights or
-            report are larger than :data:`SESSION_BYTES`.
+            If the session is already committed (its number is not above :attr:`session`), or its weights or
+            info are larger than :data:`SESSION_BYTES`.
         JournalError
-            It could not be written (a full disk, say), or the file was deleted, replaced or written to by
-            another program. What was committed before is as it was, and the same session, or a later one, may
-            be committed once the cause is gone; a session that never was is missing from the history, though
+            If it could not be written (a full disk, say), or the file was deleted, replaced or written to by
+            another program. Earlier sessions are unchanged, and the same session, or a later one, may be
+            committed once the cause is gone; a session never committed is missing from the history, though
             not from the state.
         """
         session, last = int(state.session), self._newest.session
@@ -686,9 +692,7 @@ class Journal(JournalView):
                 f"{len(weights):,} and {len(told):,}"
             )
         records, digest = self.position if position is None else position
-        row = _Row(
-            session, time.time(), records, digest, demonstration, _stamp(tree), b"", weights, told
-        )  # fmt: skip
+        row = _Row(session, time.time(), records, digest, demonstration, _stamp(tree), b"", weights, told)
         row = row._replace(chain=row.linked(self._genesis, self._newest.chain))
         newest = _Newest(session, self._newest.sessions + 1, row.chain)
         kept = f"what was committed up to session {last} is safe" if last else "nothing was committed before"
@@ -708,9 +712,9 @@ class Journal(JournalView):
 
     def close(self) -> None:
         """Fold the log into the file and release the lock; closing again does nothing."""
-        with suppress(sqlite3.Error):  # with a reader there, or a full disk, the log stays, as durable
+        with suppress(sqlite3.Error):  # with a reader, or on a full disk, the log stays, as durable
             self._connection.execute("PRAGMA busy_timeout=0")
-            # SQLite deletes the log by its name, which after a replacement is another writer's.
+            # SQLite deletes the log by its name, which after a replacement belongs to another writer.
             if not self._displaced():
                 self._connection.execute("PRAGMA journal_mode=DELETE")
         super().close()
@@ -720,11 +724,11 @@ class Journal(JournalView):
         return self
 
     def _displaced(self) -> list[Path]:
-        """Files that are no longer the ones that were opened."""
+        """List the files that are no longer the ones that were opened."""
         return [file for file, identity in self._files.items() if Identity.of(file) != identity]
 
     def _require_undisturbed(self, session: int) -> None:
-        """Refuse to go on where a commit would vanish with a deleted file, or mix with another writer's."""
+        """Refuse a commit that would vanish with a deleted file, or mix with another writer's."""
         if displaced := self._displaced():
             raise JournalError(
                 f"{displaced[0]} was deleted or replaced while its journal was open: session {session} was "
@@ -782,7 +786,7 @@ def _is_empty(connection: sqlite3.Connection) -> bool:
 
 
 def _create(connection: sqlite3.Connection, origin: Origin) -> None:
-    # Before the file is switched to the log, so that its very header tells what it is.
+    # Before the switch to the log, so that the file's header identifies it at once.
     content = json.dumps(origin._asdict())
     genesis = hashlib.blake2b(content.encode(), digest_size=32).digest()
     with _transaction(connection):
@@ -794,7 +798,7 @@ def _create(connection: sqlite3.Connection, origin: Origin) -> None:
 
 
 def _migrate(view: JournalView) -> None:
-    """Add what version 2 has and version 1 has not: digests, computed from what is there."""
+    """Add the digests of version 2 to version 1, computed from the content."""
     connection, newest = view._connection, view._state()
     with view._any_length(), _transaction(connection):
         tree = connection.execute("SELECT coalesce(max(tree), x'') FROM state").fetchone()[0]
@@ -812,10 +816,10 @@ def _migrate(view: JournalView) -> None:
 
 
 def _require_alone(connection: sqlite3.Connection, lock: Lock) -> None:
-    """Refuse a journal that somebody has open under another lock file than the one that was just locked.
+    """Refuse a journal that another writer has open under a lock file other than the one just locked.
 
-    The last writer said which lock file it had. If it is another, having it proves nothing, and SQLite says
-    whether somebody else is there: it leaves the log only for a connection that is alone.
+    The last writer recorded its lock file. If it is another one, holding this lock proves nothing, and SQLite
+    decides whether another connection exists: it leaves the log mode only for a connection that is alone.
     """
     if connection.execute("PRAGMA journal_mode").fetchone()[0] != "wal":
         return
@@ -834,7 +838,7 @@ def _require_alone(connection: sqlite3.Connection, lock: Lock) -> None:
 def journal_files(path: str | os.PathLike[str]) -> tuple[Path, ...]:
     """Return every file that belongs to the journal at a path: itself, its log, and its lock.
 
-    Raises :class:`JournalError` for a path that leads nowhere (a circle of links, a name too long).
+    Raises :class:`JournalError` for a path that cannot be resolved (a circle of links, a name too long).
     """
     try:
         path = Path(path).resolve()
@@ -845,7 +849,7 @@ def journal_files(path: str | os.PathLike[str]) -> tuple[Path, ...]:
 
 
 def require_apart(argument: str, given: str | os.PathLike[str], *others: str | os.PathLike[str]) -> None:
-    """Raise ``ValueError`` for a file to be written that is another file in use, by whatever name."""
+    """Raise ``ValueError`` for an output file that is another file in use, by whatever name."""
     wanted = Path(given)
     for other in map(Path, others):
         same = other.exists() and wanted.exists() and wanted.samefile(other)
@@ -854,7 +858,7 @@ def require_apart(argument: str, given: str | os.PathLike[str], *others: str | o
 
 
 def _lacks_log(path: Path) -> bool:
-    """Say whether a journal was being written when it was last closed, and its log is not beside it."""
+    """Return whether a journal was last closed during writing, and its log is not beside it."""
     if not path.exists() or path.with_name(path.name + "-wal").exists():
         return False
     header = header_of(path) or b""
@@ -884,7 +888,7 @@ def _refuse_foreign(path: Path) -> None:
 def _require_readable(connection: sqlite3.Connection, path: Path) -> None:
     application = connection.execute("PRAGMA application_id").fetchone()[0]
     _require_ours(application, connection.execute("PRAGMA user_version").fetchone()[0], path)
-    # What is no table could compute without end, or change what is committed.
+    # Views and triggers could compute without end, or change committed rows.
     query = "SELECT type, name FROM sqlite_master WHERE type IN ('view', 'trigger')"
     if (found := connection.execute(query).fetchone()) is not None:
         raise JournalError(f"{path} is damaged: it has the {found[0]} {shortened(found[1])}")
@@ -936,7 +940,7 @@ def _dataset(records: Sequence[SessionRecord], origin: Origin) -> Any:
 
 
 def _stacked(values: Sequence[Any]) -> np.ndarray:
-    """One array ``[session, ...]``, NaN (or an empty text) where a session has less than another."""
+    """Stack one array ``[session, ...]``, NaN (or an empty text) for sessions with fewer entries."""
     if not values:
         return np.zeros(0)
     present = [np.asarray(value) for value in values if value is not None]

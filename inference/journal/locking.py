@@ -1,4 +1,4 @@
-"""A journal's files: who may write them, and whether they still are the files that were opened.
+"""Locks on a journal's files, and checks that they are still the files that were opened.
 
 SQLite's locks on a file belong to the process, and closing any descriptor of that file releases them all. So
 the header is read here only while this process has no connection to the file (:func:`header_of`,
@@ -25,11 +25,11 @@ class JournalError(RuntimeError):
 
 
 class JournalBusy(JournalError):
-    """Another writer holds the journal."""
+    """A journal that another writer holds."""
 
 
 def connect(path: Path, mode: str, timeout: float = 10.0) -> sqlite3.Connection:
-    """Connect to a file as SQLite's ``mode`` says (``ro``, ``rw`` or ``rwc``)."""
+    """Connect to a file in SQLite's ``mode`` (``ro``, ``rw`` or ``rwc``)."""
     uri = f"{path.as_uri()}?mode={mode}"
     return sqlite3.connect(uri, uri=True, timeout=timeout, isolation_level=None, check_same_thread=False)
 
@@ -38,7 +38,7 @@ def connect(path: Path, mode: str, timeout: float = 10.0) -> sqlite3.Connection:
 def explained(path: Path, doing: str) -> Iterator[None]:
     """Turn SQLite's errors into :class:`JournalError`: ``path`` cannot ``doing``, and why.
 
-    A damaged file also makes SQLite ask for more memory than there is, or quote what is no text.
+    A damaged file may also make SQLite ask for too much memory, or quote invalid text.
     """
     try:
         yield
@@ -50,7 +50,7 @@ def explained(path: Path, doing: str) -> Iterator[None]:
 
 
 class Identity(NamedTuple):
-    """Which file a path leads to: no other file has the same identity while this one is open."""
+    """Identity of a file: no other file has the same one while this one is open."""
 
     device: int
     number: int
@@ -60,7 +60,7 @@ class Identity(NamedTuple):
 
     @staticmethod
     def of(path: Path | str | int) -> Identity | None:
-        """The identity of an open file, or of the file now at a path; None where there is none."""
+        """Return the identity of an open file, or of the file now at a path; None if there is none."""
         try:
             found = os.stat(path)
         except FileNotFoundError:
@@ -73,9 +73,9 @@ _connections: Counter[Identity | None] = Counter()
 
 
 class InUse:
-    """Notice that this process has a connection to a file, from before it connects until :meth:`release`.
+    """Record that this process has a connection to a file, from before it connects until :meth:`release`.
 
-    With ``create`` an empty file is made where there is none. Raises ``OSError``.
+    With ``create`` an empty file is made if there is none. Raises ``OSError``.
     """
 
     def __init__(self, path: Path, *, create: bool = False) -> None:
@@ -86,7 +86,7 @@ class InUse:
             _connections[self._identity] += 1
 
     def release(self) -> None:
-        """Say that the connection is closed; saying so again does nothing."""
+        """Record that the connection is closed; repeated calls do nothing."""
         with _guard:
             _connections[self._identity] -= 1
             self._identity = None
@@ -95,7 +95,7 @@ class InUse:
 def header_of(path: Path) -> bytes | None:
     """Read a file's first bytes without SQLite, which might recover the file or lock it.
 
-    Returns None where this process has a connection to the file: its header was read before, and reading it
+    Returns None if this process has a connection to the file: its header was read before, and reading it
     again would release that connection's locks.
     """
     with _guard:
@@ -110,10 +110,10 @@ def header_of(path: Path) -> bytes | None:
 
 
 class Lock:
-    """The writer's exclusive lock on ``<path>-lock``: a file of its own, so that readers are not shut out.
+    """The writer's exclusive lock on ``<path>-lock``, a separate file, so that readers can connect.
 
-    It is SQLite's own file lock: released by the system with the process, seen by other connections of the
-    same process, and there on every system that SQLite runs on. The empty file stays behind.
+    It is SQLite's own file lock: the system releases it with the process, other connections of the same
+    process see it, and every system that runs SQLite has it. The empty file stays behind.
     """
 
     def __init__(self, path: Path) -> None:
@@ -142,7 +142,7 @@ class Lock:
         self.release()
 
     def release(self) -> None:
-        """Let another writer in; releasing again does nothing."""
+        """Release the lock; releasing again does nothing."""
         self._connection.close()
 
     def _holder(self) -> str:

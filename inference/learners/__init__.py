@@ -1,4 +1,4 @@
-"""Learners of rewards as weights of features: one function a method, and the baselines.
+"""Learners of rewards as weights of features, one function per method, and the baselines.
 
 Imports the rooms of mixtures, sensors, sessions, programs and completion.
 """

@@ -1,4 +1,4 @@
-"""Parts of a session that alternates completion and program: what LME-I2RL and RIMEO share."""
+"""Parts of a session that alternates completion and program, shared by LME-I2RL and RIMEO."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from ..sessions.statistic import STATISTICS, FeatureStatistic, Statistic, blend,
 
 
 class Method(NamedTuple):
-    """Choices that the parts of a session share."""
+    """Choices that all parts of a session share."""
 
     mdp: TabularMDP
     sensor: AnySensor
@@ -51,9 +51,9 @@ class Method(NamedTuple):
         return complete(self.mdp, posterior, evidence.live, seen)
 
     def working(self, kept: Any, key: Array, plan: SoftPlan, evidence: Evidence, seen: Array) -> tuple:
-        """What the M-step fits, and the session's exact log-likelihood under ``plan``.
+        """Return the statistic for the M-step, and the session's exact log-likelihood under ``plan``.
 
-        It fits the carried statistic and the current session, completed under ``plan``.
+        The statistic adds the current session, completed under ``plan``, to the carried one.
         """
         completed = self.e_step(key, plan, evidence, seen)
         working = blend(kept, self.statistic.of_session(self.mdp, plan, completed))
@@ -73,7 +73,7 @@ class Method(NamedTuple):
         return jnp.linalg.norm(objective.features - expected)
 
     def penalties(self, statistic: Any, session: Int[Array, ""]) -> tuple:
-        """Slack of the program in a session, and the prior's precision per trajectory."""
+        """Return the slack of the program in a session, and the prior's precision per trajectory."""
         slack = program_slack(self.slack, session, self.statistic.slack(self.mdp, 1.0))
         return slack, self.ridge / jnp.maximum(statistic.size, 1.0)
 
@@ -108,7 +108,7 @@ def checked_method(
 
 
 def random_weights(key: Array, mdp: TabularMDP) -> Float[Array, " K"]:
-    """``theta^0_k ~ uniform(0, 1)``, scaled (Algorithm 1, line 2)."""
+    """Draw ``theta^0_k ~ uniform(0, 1)``, scaled (Algorithm 1, line 2)."""
     return jax.random.uniform(key, (mdp.n_features,), float)
 
 

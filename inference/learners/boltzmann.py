@@ -1,8 +1,8 @@
 """The Boltzmann-rational expert: ``pi(a | s) ~ exp(rationality Q*(s, a))``.
 
 The likelihood of Bayesian and maximum-likelihood IRL (Ramachandran and Amir 2007; Babes-Vroman et al. 2011;
-Choi and Kim 2012). Unlike the soft policy of maximum causal entropy, the expert plans as if it would act
-optimally from the next step on, and only then errs. Trajectories enter through their visit counts alone: the
+Choi and Kim 2012). Unlike the soft policy of maximum causal entropy, the expert plans for optimal actions
+from the next step on, but errs in the present one. Trajectories enter through their visit counts alone: the
 dynamics' part of their probability does not depend on the weights and is left out.
 """
 
@@ -26,10 +26,10 @@ BOX = 1.0
 
 
 def optimal_action_values(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """``Q*(s, a)``, differentiable in the weights wherever each state has one best action.
+    """Return ``Q*(s, a)``, differentiable in the weights if each state has one best action.
 
-    There ``dQ* / dtheta = phi + gamma P mu`` with ``mu`` the features to go of the greedy policy; where
-    several actions are best, the derivative is that of the first. ``-inf`` where an action is unavailable.
+    The derivative is ``dQ* / dtheta = phi + gamma P mu`` with ``mu`` the features to go of the greedy policy;
+    for tied actions it is that of the first. Unavailable actions have ``-inf``.
     """
     plan = hard_plan(mdp, reward_of(mdp, lax.stop_gradient(weights)))
     greedy = jax.nn.one_hot(jnp.argmax(plan.action_values, axis=1), mdp.n_actions)
@@ -54,11 +54,11 @@ def boltzmann_log_likelihoods(
     counts: Float[Array, "n S A"],
     rationality: float | Array = ETA,
 ) -> Float[Array, " n"]:
-    """``sum_{s, a} N_i(s, a) log pi(a | s)`` of each trajectory's visits ``N_i``, in nats.
+    """Return ``sum_{s, a} N_i(s, a) log pi(a | s)`` of each trajectory's visits ``N_i``, in nats.
 
     Differentiable as :func:`optimal_action_values`. Raises ``DemonstrationError`` for a visit to an
-    unavailable action, naming trajectory, state and action (under a trace, where nothing can be raised, the
-    trajectory's log-likelihood is ``-inf``).
+    unavailable action, naming trajectory, state and action (under a trace the trajectory's log-likelihood is
+    ``-inf`` instead).
     """
     require_available_visits(mdp, counts)
     return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, rationality), counts)
@@ -67,7 +67,7 @@ def boltzmann_log_likelihoods(
 def count_log_likelihoods(
     mdp: TabularMDP, log_policy: Float[Array, "S A"], counts: Float[Array, "n S A"]
 ) -> Float[Array, " n"]:
-    """``sum N_i log pi`` with ``0 log 0 = 0``."""
+    """Return ``sum N_i log pi`` with ``0 log 0 = 0``."""
     finite = jnp.where(mdp.available, log_policy, 0.0)
     impossible = jnp.any((counts > 0) & ~mdp.available, axis=(1, 2))
     return jnp.where(impossible, -jnp.inf, jnp.einsum("nsa,sa->n", counts, finite))
@@ -79,8 +79,10 @@ def require_available_visits(mdp: TabularMDP, counts: Float[Array, "n S A"]) -> 
         return
     given, expected = np.asarray(counts), (mdp.n_states, mdp.n_actions)
     if given.ndim != 3 or given.shape[1:] != expected:
-        raise ValueError(f"visit counts must have shape [n, S, A] = [n, {expected[0]}, {expected[1]}], "
-                         f"got {list(given.shape)}")  # fmt: skip
+        raise ValueError(
+            f"visit counts must have shape [n, S, A] = [n, {expected[0]}, {expected[1]}], "
+            f"got {list(given.shape)}"
+        )
     wrong = np.argwhere((given > 0) & ~np.asarray(mdp.available))
     if len(wrong):
         i, s, a = wrong[0]
@@ -90,11 +92,11 @@ def require_available_visits(mdp: TabularMDP, counts: Float[Array, "n S A"]) -> 
 
 
 def visit_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.ndarray, "n S A"]:
-    """``N_i(s, a)``: how often each trajectory visits each pair; padding rows count nothing.
+    """Count ``N_i(s, a)``, the visits of each trajectory to each pair; padding rows count zero.
 
-    Raises ``DemonstrationError`` that names trajectory and step: for a step that was hidden, lost or seen in
-    part (these methods need to see every step), for an index that is no state or action, and for an action
-    that is not available; and without a step in any trajectory.
+    Raises ``DemonstrationError`` naming trajectory and step: for a step that was hidden, lost or seen in part
+    (these methods need every step), for an index out of range, and for an unavailable action; also if no
+    trajectory has a step.
     """
     kind, state, action, _ = checked_demonstration(mdp, demonstration).arrays
     live = kind != PAD
@@ -121,11 +123,11 @@ def visit_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.ndar
     return counts
 
 
-# -- what the baselines share ---------------------------------------------------------------------------
+# -- parts of the baselines -----------------------------------------------------------------------------
 
 
 def random_weights(key: Array, n_features: int) -> Float[Array, " K"]:
-    """Uniform on the box."""
+    """Draw weights uniformly on the box."""
     return jax.random.uniform(key, (n_features,), float, -BOX, BOX)
 
 

@@ -1,21 +1,20 @@
 """DARKO (Rhinehart and Kitani 2017) as an online learner: gradient steps on the session's own feature margin.
 
-A session is what was seen from one goal to the next (section 3.2): :func:`goal_sessions` cuts a stream of
+A session is the behaviour from one goal to the next (section 3.2): :func:`goal_sessions` cuts a stream of
 behaviour there. Its weights are those of the session before, moved down the gradient of the margin
-``E[phi | pi] - phi_hat``, ``pi`` being the soft policy of the complete MDP. Nothing but the weights is
-carried on.
+``E[phi | pi] - phi_hat``, ``pi`` being the soft policy of the complete MDP. Sessions carry the weights alone.
 
-That makes it ME-I2RL with its statistic emptied, as "Generalization to Existing Methods" (chapter 4) says:
-with ``|X_{i-1}| = 0`` and ``phi_hat^{1:i-1} = 0`` Eq. 4.2 leaves ``phi_hat^{1:i} = phi_hat^i``, the
-program of Theorem 1 is that of the session alone, and the step taken here is down the gradient of its dual.
-The session is summarised by the very ``features`` statistic of ME-I2RL.
+This is ME-I2RL with an empty statistic, as "Generalization to Existing Methods" (chapter 4) says: with
+``|X_{i-1}| = 0`` and ``phi_hat^{1:i-1} = 0`` Eq. 4.2 leaves ``phi_hat^{1:i} = phi_hat^i``, the program of
+Theorem 1 is that of the session alone, and a step here is one down the gradient of its dual. The session is
+summarised by the ``features`` statistic of ME-I2RL.
 
-Where a goal ends the session but not the task, as on a patrol, the MDP goes on after it, and so does the
-plan: what follows is filled in under the current policy, as for any fragment. DARKO itself makes goals
-absorbing. Where they do end the task, :func:`ending_at` says so in the MDP and nothing follows. Which it
-is matters: a soft planner is paid for keeping its options open, up to ``log |A|`` nats a step, and where a
-goal ends that pay every weight has to fall until arriving is worth it. DARKO's own planner, undiscounted and
-deterministic, conditions on arriving instead; with chance in the dynamics no policy can promise to arrive.
+If a goal ends the session but not the task, as on a patrol, the MDP and the plan continue after it: later
+steps are completed under the current policy, as for any fragment. DARKO itself makes goals absorbing. If they
+do end the task, :func:`ending_at` puts this into the MDP, and no steps follow. The choice matters: a soft
+planner is paid for open options, up to ``log |A|`` nats a step. If a goal ends that pay, every weight has to
+fall until arriving is worth it. DARKO's own planner, undiscounted and deterministic, conditions on arriving
+instead; with chance in the dynamics no policy can guarantee arrival.
 """
 
 from __future__ import annotations
@@ -47,10 +46,10 @@ from ..sessions.statistic import FEATURES, FeatureStatistic, complete
 
 @shown_briefly
 class DarkoState(NamedTuple):
-    """What DARKO carries on.
+    """State that DARKO carries from session to session.
 
     ``weights [K]``; an empty statistic; ``values [S]``, the weights' soft values, from which planning
-    starts (they follow from the weights and are no statistic); sessions so far.
+    starts (they follow from the weights); number of sessions so far.
     """
 
     weights: Float[Array, " K"]
@@ -61,10 +60,10 @@ class DarkoState(NamedTuple):
 
 @shown_briefly
 class Margin(NamedTuple):
-    """A session under some weights: ``margin [K]``, ``E[phi | pi] - phi_hat``, and what it was made of.
+    """Margin of a session under some weights: ``margin [K]``, ``E[phi | pi] - phi_hat``, and its parts.
 
     ``statistic`` holds ``phi_hat`` and the start distribution, ``values [S]`` are the weights' soft values
-    and ``log_likelihood`` is that of the demonstration, in nats (-inf if it cannot be).
+    and ``log_likelihood`` is that of the demonstration, in nats (-inf if it is impossible).
     """
 
     margin: Float[Array, " K"]
@@ -79,9 +78,9 @@ def feature_margin(
     demonstration: Demonstration,
     values: Float[Array, " S"] | None = None,
 ) -> Margin:
-    """Margin ``E[phi | pi] - phi_hat`` of a session alone, per trajectory, in units of discounted features.
+    """Return the margin ``E[phi | pi] - phi_hat`` of a session alone, per trajectory, in discounted features.
 
-    Both expectations start where the session's trajectories did. ``values [S]`` warm-starts the plan. The
+    Both expectations start at the session's first states. ``values [S]`` warm-starts the plan. The
     margin is the gradient of ``start.V - theta.phi_hat``, the dual of ME-I2RL's ``features`` program for
     this session's statistic.
     """
@@ -122,13 +121,12 @@ def darko_i2rl(
     radius: float = math.inf,
     steps: int = 1,
 ) -> Learner:
-    """DARKO: online projected gradient descent on the feature margin, under full observability.
+    """Build DARKO: online projected gradient descent on the feature margin, under full observability.
 
     ``theta^i = project(theta^{i-1} - lambda_i (E[phi | pi] - phi_hat^i))``, with soft value iteration for
-    ``pi`` and the Euclidean ball of ``radius`` to project on. Goals and the cutting of the stream are
-    :func:`goal_sessions`'s part; any other demonstration is a session too. Frames that were lost are
-    completed under the current policy; a hidden step is an error, as for ME-I2RL: the learner is taken to
-    see the expert at all times.
+    ``pi`` and projection on the Euclidean ball of ``radius``. :func:`goal_sessions` finds goals and cuts the
+    stream; any other demonstration is a session too. Lost frames are completed under the current policy; a
+    hidden step is an error, as for ME-I2RL: the method assumes full visibility.
 
     Parameters
     ----------
@@ -137,22 +135,22 @@ def darko_i2rl(
         Its initial distribution must allow the goals, where sessions start.
     learning_rate : float
         ``lambda``, per unit of discounted scaled features (:mod:`~i2rl.models.process.units`). The default is
-        what ``i2rl run methods`` finds good on the second patrol, from sessions of five steps.
+        the best of ``i2rl run methods`` on the second patrol, from sessions of five steps.
     decay : float
-        ``lambda_i = lambda / i^decay``. One half is what keeps the regret of online gradient descent
-        without a horizon sublinear (Zinkevich 2003); 0 keeps the rate constant.
+        ``lambda_i = lambda / i^decay``. With one half the regret of online gradient descent without a horizon
+        is sublinear (Zinkevich 2003); 0 gives a constant rate.
     radius : float
         Bound on the Euclidean norm of the scaled weights; none by default.
     steps : int
-        Gradient steps a session.
+        Gradient steps in a session.
 
     Returns
     -------
     Learner
-        The reports' ``log_likelihood`` is that of the session alone (nothing else is kept), ``gradient``
-        the norm of the margin the session began with. ``learner.log_likelihood`` is None: there is no
-        statistic to have one. ``update`` raises :class:`DemonstrationError` naming trajectory and step for
-        an observation the model rules out.
+        The info's ``log_likelihood`` is that of the session alone, ``gradient`` the norm of the margin at the
+        session's first weights. ``learner.log_likelihood`` is None, because the method has no statistic.
+        ``update`` raises :class:`DemonstrationError` naming trajectory and step for an impossible
+        observation.
 
     Raises
     ------
@@ -217,7 +215,7 @@ def _session(
         moved = weights - learning_rate * found.margin
         length = jnp.linalg.norm(moved)
         inside = moved * jnp.where(length > settings.radius, settings.radius / length, 1.0)
-        # The zeroth step only looks: one margin to compile serves the start, the steps and the end.
+        # Step zero only evaluates: one compiled margin serves the start, the steps and the end.
         weights = jnp.where(i > 0, inside, weights)
         following = _margin(mdp, weights, observed, found.values)
         return weights, following, jnp.where(i > 0, first, jnp.linalg.norm(following.margin))
@@ -247,13 +245,13 @@ def _session(
 
 
 def goal_sessions(stream: Iterable[Demonstration], goals: Bool[np.ndarray, " S"]) -> Iterator[Demonstration]:
-    """Cut a stream of behaviour where a goal is reached; each part is a session, ready for ``update``.
+    """Cut a stream of behaviour at its goals; each part is a session, ready for ``update``.
 
     ``stream`` holds consecutive pieces of one walk (``demonstration.sessions()``, say), their rows in order
-    of time; ``goals [S]`` marks the goal states. A goal is reached by being seen in it after being elsewhere:
-    waiting there is no second arrival. The pair at the goal begins the next session. A session is one
-    trajectory, padded to a power of two so that few lengths occur. What comes after the last goal is no
-    session yet and is not given out. Raises ``ValueError`` for marks that are not a boolean vector.
+    of time; ``goals [S]`` marks the goal states. A goal is reached when the expert is seen in it after being
+    elsewhere: waiting there is no second arrival. The pair at the goal begins the next session. A session is
+    one trajectory, padded to a power of two so that few lengths occur. Steps after the last goal are not
+    yielded. Raises ``ValueError`` for marks that are not a boolean vector.
     """
     goals = np.asarray(goals)
     if goals.ndim != 1 or goals.dtype != bool:
@@ -283,10 +281,9 @@ def _row(codes: list[np.ndarray], scores: list[float]) -> Demonstration:
 
 
 def stopping_places(stream: Iterable[Demonstration], n_states: int, steps: int) -> Bool[np.ndarray, " S"]:
-    """States in which the expert was seen for at least ``steps`` steps running: DARKO's goals are discovered
-    as the places where a person stops.
+    """Find states in which the expert was seen for at least ``steps`` consecutive steps: DARKO's goals.
 
-    ``stream`` as for :func:`goal_sessions`. Where moves may fail, choose ``steps`` so that staying so long
+    ``stream`` as for :func:`goal_sessions`. If moves may fail, choose ``steps`` so that staying so long
     by chance is rare. Raises ``ValueError`` for fewer than two steps.
     """
     if steps < 2:
@@ -306,14 +303,14 @@ def stopping_places(stream: Iterable[Demonstration], n_states: int, steps: int) 
 
 
 def ending_at(mdp: TabularMDP, goals: Bool[np.ndarray, " S"]) -> TabularMDP:
-    """The process in which reaching a goal ends the task, as DARKO's planner has it.
+    """Build the process in which reaching a goal ends the task, as for DARKO's planner.
 
-    One state is added, the last, which is never left and has no features. Where states have names it is
+    It has one more state, the last, which is absorbing and has no features. If states have names, it is
     "end", or "end 2" if a state has that name. Every move to a goal from another state leads there instead.
-    The goals stay as states to start from and to wait in, since a session begins where the last one ended.
-    DARKO plans for one goal at a time; here all of them end the task alike. To
-    learn from an episode append the end as its last step (:func:`with_end`), or the model takes the last
-    move to have failed, perhaps. Raises ``ValueError`` for marks of the wrong shape, or none.
+    The goals remain as first states and for waiting, since a session begins where the last one ended. DARKO
+    plans for one goal at a time; here all of them end the task. Before learning from an episode, append the
+    end as its last step (:func:`with_end`); otherwise the model may explain the last move as failed. Raises
+    ``ValueError`` for marks of the wrong shape, or none.
     """
     goals = np.asarray(goals)
     if goals.shape != (mdp.n_states,) or goals.dtype != bool or not goals.any():
@@ -343,13 +340,13 @@ def ending_at(mdp: TabularMDP, goals: Bool[np.ndarray, " S"]) -> TabularMDP:
 
 
 def _new_name(name: str, taken: tuple[str, ...]) -> str:
-    """The name, numbered if it is taken."""
+    """Return the name, numbered if it is taken."""
     candidates = (name, *(f"{name} {i}" for i in range(2, len(taken) + 3)))
     return next(candidate for candidate in candidates if candidate not in taken)
 
 
 def with_end(session: Demonstration, end: int) -> Demonstration:
-    """The session with the end state (the last of :func:`ending_at`) as the last step of each trajectory."""
+    """Append the end state (the last of :func:`ending_at`) as the last step of each trajectory."""
     n, width = session.kind.shape
     longer = session.padded(n, width + 1)
     rows, at = np.arange(n), longer.lengths

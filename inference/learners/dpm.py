@@ -1,12 +1,12 @@
-"""DPM-BIRL: Bayesian IRL of a jumble of Boltzmann experts, their number unknown (Choi and Kim 2012).
+"""DPM-BIRL: Bayesian IRL of a mixture of Boltzmann experts, their number unknown (Choi and Kim 2012).
 
-A Dirichlet process over reward weights: trajectories are seated by a Chinese restaurant process, every
-cluster's weights are uniform on ``[-1, 1]^K``, and its trajectories follow the Boltzmann policy of those
+A Dirichlet process over reward weights: a Chinese restaurant process assigns trajectories to components, each
+component's weights are uniform on ``[-1, 1]^K``, and its trajectories follow the Boltzmann policy of those
 weights. Sampled by Metropolis-Hastings: assignments are proposed from the restaurant process (Neal 2000,
 algorithm 5), weights by Langevin moves.
 
-The table of clusters has a place for every trajectory. ``n`` trajectories never sit in more than ``n``
-clusters, so the table cannot overflow: nothing is truncated.
+The table of components has a place for every trajectory. ``n`` trajectories have at most ``n`` components, so
+the table cannot overflow and nothing is truncated.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from .boltzmann import (
     visit_counts,
 )
 
-# Reflections of a move beyond the nearest are left out of its density: exact to rounding up to this width.
+# The density of a move omits reflections beyond the nearest: exact to rounding up to this width.
 _WIDEST = 0.5
 
 
@@ -49,12 +49,12 @@ class Seating(NamedTuple):
     Fields
     ------
     labels : int ``[n]``
-        The place of each trajectory's cluster in the table.
+        Place of each trajectory's component in the table.
     sizes : int ``[n]``
-        Trajectories of each place; zero where it is free.
+        Trajectories of each place; zero if it is free.
     weights : float ``[n, K]``
     log_policies : float ``[n, S, A]``
-        Boltzmann policies of ``weights``, zero where an action is unavailable.
+        Boltzmann policies of ``weights``, zero for unavailable actions.
     """
 
     labels: Int[Array, " n"]
@@ -65,7 +65,7 @@ class Seating(NamedTuple):
 
 @shown_briefly
 class Settings(NamedTuple):
-    """Numbers of the model and its sampler; see :func:`dpm_birl`."""
+    """Settings of the model and its sampler; see :func:`dpm_birl`."""
 
     alpha: Float[Array, ""]
     rationality: Float[Array, ""]
@@ -74,19 +74,19 @@ class Settings(NamedTuple):
 
 @shown_briefly
 class DPMTrace(NamedTuple):
-    """Every sweep of the sampler, the random seating it starts from left out.
+    """Every iteration of the sampler, without its random start.
 
     Fields
     ------
     labels : int ``[iterations, n]``
-        Cluster of each trajectory, numbered by first appearance, -1 for rows of padding.
+        Component of each trajectory, numbered by first appearance, -1 for rows of padding.
     n_components : int ``[iterations]``
     weights : float ``[iterations, n, K]``
-        Weights of each trajectory's cluster, NaN for rows of padding.
+        Weights of each trajectory's component, NaN for rows of padding.
     log_joint : float ``[iterations]``
-        Log-density of seating, weights and demonstration together, in nats.
+        Joint log-density of assignments, weights and demonstration, in nats.
     assignment_acceptance, weight_acceptance : float ``[iterations]``
-        Share of proposals accepted (an assignment to the same cluster counts as accepted).
+        Share of accepted proposals (an assignment to the same component counts as accepted).
     """
 
     labels: Int[np.ndarray, "sweeps n"]
@@ -102,7 +102,7 @@ class DPMBIRL(NamedTuple):
     """DPM-BIRL on one decision process.
 
     ``sample(key, demonstration)`` returns all iterations; ``fit(key, demonstration)`` the one of highest
-    joint density, each trajectory wholly in its cluster.
+    joint density, with each trajectory wholly in its component.
     """
 
     name: str
@@ -111,7 +111,7 @@ class DPMBIRL(NamedTuple):
 
 
 def crp_log_probability(sizes: Int[Array, " D"], alpha: Float[Array, ""]) -> Float[Array, ""]:
-    """Log-probability of one partition with clusters of these sizes (zeros are no clusters).
+    """Return the log-probability of one partition with components of these sizes (zeros are empty).
 
     ``alpha^D Gamma(alpha) / Gamma(alpha + n) prod_d (n_d - 1)!``
     """
@@ -134,7 +134,7 @@ def _log_joint(seating: Seating, counts: Float[Array, "n S A"], alpha: Array) ->
 
 
 def _first_seating(key: Array, mdp: TabularMDP, counts: Float[Array, "n S A"], settings: Settings) -> Seating:
-    """A random label of ``n`` for each trajectory, weights from the prior."""
+    """Draw one of ``n`` labels for each trajectory, and weights from the prior."""
     n = counts.shape[0]
     label_key, weight_key = jax.random.split(key)
     labels = jax.random.randint(label_key, (n,), 0, n)
@@ -153,12 +153,12 @@ def _reseat(
     seating: Seating,
     inputs: tuple[Int[Array, ""], Array],
 ) -> tuple[Seating, Array]:
-    """Propose another cluster for one trajectory from the restaurant process, the others being seated."""
+    """Propose another component for one trajectory from the restaurant process, given all others."""
     trajectory, key = inputs
     choice_key, prior_key, accept_key = jax.random.split(key, 3)
     here = seating.labels[trajectory]
     others = seating.sizes.at[here].add(-1)
-    # Some place is free once this trajectory has stood up: its own, if it was alone.
+    # A place is free without this trajectory: its own, if it was alone.
     free = jnp.argmin(others)
     share = jnp.log(others.at[free].set(0).astype(float)).at[free].set(jnp.log(settings.alpha))
     there = jax.random.categorical(choice_key, share)
@@ -185,7 +185,7 @@ def _reseat(
 
 
 def log_move(to: Float[Array, " K"], mean: Float[Array, " K"], sigma: Array) -> Float[Array, ""]:
-    """Log-density of a reflected Gaussian move, a constant left out."""
+    """Return the log-density of a reflected Gaussian move, up to a constant."""
     images = jnp.stack([to, 2 * BOX - to, -2 * BOX - to, to + 4 * BOX, to - 4 * BOX])
     return jnp.sum(jax.nn.logsumexp(-0.5 * ((images - mean) / sigma) ** 2, axis=0))
 
@@ -199,7 +199,7 @@ def _langevin(
     key: Array,
     updates: int,
 ) -> tuple:
-    """Langevin moves of one cluster's weights, Metropolis-corrected; the uniform prior has no gradient."""
+    """Make Langevin moves of a component's weights, Metropolis-corrected; a uniform prior has no gradient."""
     sigma = settings.sigma
 
     @partial(jax.value_and_grad, has_aux=True)
@@ -297,19 +297,18 @@ def dpm_birl(
     updates: int = 10,
     sigma: float = 0.01,
 ) -> DPMBIRL:
-    """Dirichlet-process mixture Bayesian IRL (Choi and Kim 2012), sampled by Metropolis-Hastings.
+    """Build Dirichlet-process mixture Bayesian IRL (Choi and Kim 2012), sampled by Metropolis-Hastings.
 
-    A sweep proposes ``proposals`` times another cluster for each trajectory (an existing one in proportion
-    to its size without the trajectory, a new one in proportion to ``alpha`` with weights from the prior)
-    and accepts with ``min(1, P(X | theta') / P(X | theta))``; then moves every cluster's weights
-    ``updates`` times. Starts from a random one of ``n`` labels for each trajectory.
+    An iteration proposes ``proposals`` times another component for each trajectory (an existing one in
+    proportion to its size without the trajectory, a new one in proportion to ``alpha`` with weights from the
+    prior) and accepts with ``min(1, P(X | theta') / P(X | theta))``; then it moves every component's weights
+    ``updates`` times. It starts from a random one of ``n`` labels for each trajectory.
 
-    The prior of a cluster's scaled weights (:mod:`~i2rl.models.process.units`) is uniform on the box, the
-    default of the authors' code; the dissertation writes a Gaussian base distribution, whose width it does
-    not give.
+    The prior of a component's scaled weights (:mod:`~i2rl.models.process.units`) is uniform on the box, the
+    default of the authors' code; the dissertation has a Gaussian base distribution of unstated width.
 
-    One deviation from the authors' code: it clips a proposed weight that leaves the box, which has no
-    density to correct for and piles weights up on the boundary. Here the drift is clipped and the noise
+    There is one deviation from the authors' code: it clips a proposed weight that leaves the box, a move
+    without density, which piles weights up on the boundary. Here the drift is clipped and the noise
     reflected, and the correction uses the density of exactly that, so the sampler's distribution is the
     posterior.
 
@@ -319,17 +318,17 @@ def dpm_birl(
     rationality : float
         Inverse temperature of the experts, per unit of value.
     alpha : float
-        Concentration: large values expect many clusters.
+        Concentration: large values favour many components.
     iterations, proposals, updates : int
-        Outer iterations; assignment proposals per trajectory and weight moves per cluster in each.
+        Outer iterations; assignment proposals per trajectory and weight moves per component in each.
     sigma : float
         Width of the scaled weights' moves, at most 0.5.
 
     Returns
     -------
     DPMBIRL
-        Its functions raise ``DemonstrationError`` naming trajectory and step for one that was not seen or
-        that is impossible. A number of trajectories not met before is compiled for.
+        Its functions raise ``DemonstrationError`` naming trajectory and step for one that was hidden or
+        impossible. They compile once for each number of trajectories.
 
     Raises
     ------
@@ -372,7 +371,7 @@ def dpm_birl(
 
 
 def best_sample(trace: DPMTrace) -> Clustering:
-    """The sweep of highest joint density as a clustering; rows of padding get the proportions."""
+    """Return the iteration of highest joint density as a clustering; padding rows get the proportions."""
     best = int(np.argmax(trace.log_joint))
     labels, n_components = trace.labels[best], int(trace.n_components[best])
     responsibilities = (labels[:, None] == np.arange(n_components)).astype(float)
@@ -383,6 +382,6 @@ def best_sample(trace: DPMTrace) -> Clustering:
 
 
 def _by_appearance(labels: Int[np.ndarray, " n"]) -> Int[np.ndarray, " n"]:
-    """The same partition with clusters numbered in the order in which they appear."""
+    """Renumber the components of a partition in the order in which they appear."""
     _, first, inverse = np.unique(labels, return_index=True, return_inverse=True)
     return np.argsort(np.argsort(first))[inverse]

@@ -1,11 +1,10 @@
-"""What reports can tell about perception at all: who errs, the expert or the sensor?
+"""Identification of a sensor's noise: separates the expert's errors from the sensor's.
 
-A report that fits badly is explained by an expert who errs as well as by a sensor that does. Where every pair
-that is reported could have happened, the likelihood of Eq. 6.5 hardly tells the two apart (and what it
-does tell may come from predicates that describe the sensor badly); scores, or knowing how decided the expert
-is, must. So the sensor is fitted twice to one demonstration: to an expert as erratic as was learned, and to
-one who always does what is best under the same reward. Where the two disagree, agreement is known only to
-lie between them.
+An observation that fits badly may be the expert's error as well as the sensor's. If every observed pair is
+possible, the likelihood of Eq. 6.5 hardly distinguishes the two (and the little it does may come from
+predicates that describe the sensor badly). Scores, or knowledge of the expert's rationality, must. The sensor
+is therefore fitted twice to one demonstration: for an expert as erratic as the learned one, and for one who
+always acts optimally under the same reward. If the two disagree, agreement is known only to lie between them.
 """
 
 from __future__ import annotations
@@ -38,25 +37,25 @@ from ..sensors.observations import report_classes, report_log_evidence
 from ..sensors.reliabilities import Perception, PreparedSession, entropic_perception, prepare
 from .noisy import DEFAULT_START, initial_logits
 
-# How often the decided expert still errs, so that nothing is ruled out.
+# Error rate of the optimal expert, so that all observations stay possible.
 _ERRS = 1e-3
 _ITERATIONS = 100
 
 
 @shown_briefly
 class SensorIdentification(NamedTuple):
-    """How far agreement depends on what is assumed of the expert.
+    """Dependence of agreement on the assumed behaviour of the expert.
 
     Fields
     ------
     erratic : float ``[J]``
-        Agreement of reports with truths if the expert is as erratic as was learned.
+        Agreement of observations with truths if the expert is as erratic as learned.
     decided : float ``[J]``
-        If he always does what is best under the learned reward.
+        Agreement if the expert always acts optimally under the learned reward.
     structure : Identification
-        What no reports of this demonstration could tell, whoever errs.
+        Predicates that no observation of this demonstration identifies, whatever the expert does.
     tolerance : float
-        By how much the two may differ.
+        Largest difference of the two for an identified predicate.
     """
 
     erratic: Float[np.ndarray, " J"]
@@ -66,13 +65,13 @@ class SensorIdentification(NamedTuple):
 
     @property
     def identified(self) -> Bool[np.ndarray, " J"]:
-        """Whether a predicate's agreement is known, up to the tolerance."""
+        """Marks of predicates whose agreement is known, up to the tolerance."""
         known: Bool[np.ndarray, " J"] = np.abs(self.erratic - self.decided) <= self.tolerance
         known[list(self.structure.uninformative)] = False
         return known
 
     def describe(self, names: tuple[str, ...] | None = None) -> str:
-        """What cannot be told, in words; empty if everything can."""
+        """Describe the unidentified predicates in words; empty if all are identified."""
         called = [f"predicate {j}" if names is None else names[j] for j in range(len(self.erratic))]
         lines = [
             f"{called[j]}: not identified; reports agree in {self.decided[j]:.0%} of cases if the expert "
@@ -91,24 +90,24 @@ def sensor_identification(
     weights: ArrayLike,
     **options: Any,
 ) -> SensorIdentification:
-    """Fit the sensor under the learned reward, to an erratic and to a decided expert.
+    """Fit the sensor under the learned reward, for an erratic and for an optimal expert.
 
     Parameters
     ----------
     mdp, predicates
-        As of :func:`~i2rl.inference.rimeo`.
+        As for :func:`~i2rl.inference.rimeo`.
     demonstration : Demonstration
-        To judge by, the more the better; needs no truth.
+        Observations to fit, the more the better; needs no truth.
     weights : float ``[K]``
-        The reward that was learned.
+        The learned reward.
     **options
-        Of :func:`sensor_identifier`, which is the better choice for many demonstrations.
+        Options of :func:`sensor_identifier`, which is the better choice for many demonstrations.
 
     Raises
     ------
     ValueError
-        For weights or predicates of the wrong shape, options that do not exist, and a demonstration in which
-        nothing was reported, or something that no truth could give.
+        For weights or predicates of the wrong shape, unknown options, and a demonstration without
+        observations or with an impossible one.
     """
     return sensor_identifier(mdp, predicates, **options)(demonstration, weights)
 
@@ -123,10 +122,10 @@ def sensor_identifier(
     errors: float = 0.25,
     tolerance: float = 0.05,
 ) -> Callable[[Demonstration, ArrayLike], SensorIdentification]:
-    """:func:`sensor_identification` of many demonstrations, compiled once for each of their shapes.
+    """Build :func:`sensor_identification` for many demonstrations, compiled once for each of their shapes.
 
-    ``view``, ``reportable``, ``scores`` and ``errors`` are those of :func:`~i2rl.inference.rimeo`; agreement
-    may differ by ``tolerance`` and still be called identified.
+    ``view``, ``reportable``, ``scores`` and ``errors`` are those of :func:`~i2rl.inference.rimeo`; predicates
+    whose agreement differs by at most ``tolerance`` count as identified.
     """
     if scores not in ("stepwise", "averaged", "none"):
         raise ValueError(f"scores must be one of stepwise, averaged, none, got {scores!r}")
@@ -166,7 +165,7 @@ def sensor_identifier(
         if not np.isfinite(likely).all():
             require_possible(FeatureNoise(psi, np.full(len(psi), 0.5), mask) * seen, mdp, demonstration)
             raise DemonstrationError("a trajectory has probability zero under the learned policy")
-        # Wherever this expert may be: what differs nowhere cannot be told.
+        # Uniform over the reachable truths: predicates that agree on all of them are not identified.
         structure = unidentified_predicates(psi, np.asarray(decided), reportable)
         return SensorIdentification(np.asarray(erratic), np.asarray(sure), structure, tolerance)
 
@@ -179,9 +178,9 @@ def _fit(
     visibility: Float[Array, " S"] | None,
     first_logits: Float[Array, " J"],
 ) -> Callable[[PreparedSession, Float[Array, "S A"]], tuple[Float[Array, " J"], Float[Array, " n"]]]:
-    """Agreement after the alternation of truths and sensor, the expert's behaviour being given.
+    """Return the agreement after alternating truths and sensor, for given behaviour of the expert.
 
-    With the log-likelihood of each trajectory.
+    Also returns the log-likelihood of each trajectory.
     """
 
     @jax.jit

@@ -1,16 +1,16 @@
 """The incremental method of Jin et al. (2011) as an online learner: a reward corrected by every mistake.
 
-A session is one state-action pair (section 3.2). Solve the MDP with the reward so far; where the expert did
-something else than the predicted optimal action, move the reward towards making it right,
-``R^i = R^{i-1} + alpha v_i``. Nothing but the reward is carried on: the method has no sufficient statistic
-(Table 8.1).
+A session is one state-action pair (section 3.2). Solve the MDP with the reward so far; if the expert's action
+differs from the predicted optimal one, move the reward towards making it right,
+``R^i = R^{i-1} + alpha v_i``. Sessions carry the reward alone: the method has no sufficient statistic (Table
+8.1).
 
 The dissertation calls ``v_i`` "the difference in the expected value of the observed action and the
-(predicted) optimal action". Added to a reward it must be a vector: it is read here as the gradient of that
-difference in the reward, ``v_i = d/dR [Q(s, a) - Q(s, a*)]`` under the predicted policy, which is the
-difference between the expected discounted visits after the one and after the other. The difference of
-values itself is ``v_i . R`` (values are linear in the reward), and what is added is the mistake-driven
-step of a perceptron, which the paper's bound on the number of mistakes is about.
+(predicted) optimal action". Added to a reward it must be a vector. Here it is the gradient of that difference
+in the reward, ``v_i = d/dR [Q(s, a) - Q(s, a*)]`` under the predicted policy: the difference between the
+expected discounted visits after the one and after the other. The difference of values itself is ``v_i . R``
+(values are linear in the reward), and the correction is the mistake-driven step of a perceptron, the subject
+of the paper's bound on the number of mistakes.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ from ..sessions.scaling import on_scaled_features
 
 @shown_briefly
 class JinState(NamedTuple):
-    """What the method carries on: ``weights [K]``, the reward; an empty statistic; sessions so far."""
+    """State of the method: ``weights [K]``, the reward; an empty statistic; number of sessions so far."""
 
     weights: Float[Array, " K"]
     statistic: tuple[()]
@@ -53,17 +53,17 @@ class JinState(NamedTuple):
 
 @shown_briefly
 class Correction(NamedTuple):
-    """What a pair says about a reward: ``direction [K]`` (``v_i``) and whether the prediction was wrong."""
+    """Correction of a reward by a pair: ``direction [K]`` (``v_i``), and a flag of a wrong prediction."""
 
     direction: Float[Array, " K"]
     mistaken: Bool[Array, ""]
 
 
 def with_state_features(mdp: TabularMDP) -> TabularMDP:
-    """The same process with one feature a state, its indicator: weights are then a reward table ``R [S]``.
+    """Replace the features by one indicator per state: weights are then a reward table ``R [S]``.
 
-    Every tool that takes an MDP and weights so works on reward tables. A reward of the actions, such as a
-    price of turning, is beyond what such a table can say.
+    Every tool that takes an MDP and weights thereby works on reward tables. Such a table cannot express a
+    reward of actions, such as a cost of turning.
     """
     indicators = jnp.eye(mdp.n_states)[:, None, :] * mdp.available[:, :, None]
     labels = Labels(mdp.labels.states, mdp.labels.actions, mdp.state_names)
@@ -73,39 +73,39 @@ def with_state_features(mdp: TabularMDP) -> TabularMDP:
 def reward_correction(
     mdp: TabularMDP, weights: Float[Array, " K"], state: Int[Array, ""], action: Int[Array, ""]
 ) -> Correction:
-    """``v_i`` of one observed pair: how the value of its action, less that of the predicted one, grows.
+    """Return ``v_i`` of one observed pair: the gradient of its action's value minus the predicted one's.
 
     ``direction = phi(s, a) - phi(s, a*) + gamma (P(.|s, a) - P(.|s, a*)) . mu``, with ``mu`` the expected
     discounted features under the optimal policy for ``weights`` (its first optimal action in every state).
-    Zero where the observed action is the predicted one.
+    The result is zero if the observed action is the predicted one.
     """
     policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, weights)).optimal)
     predicted = jnp.argmax(policy[state])
-    # Occupancy is linear in the distribution it starts from: one solve gives both expectations' difference.
+    # Occupancy is linear in its first distribution: one solve gives the difference of both expectations.
     apart = (
         jnp.zeros(mdp.n_states)
-        .at[mdp.successors[state, action]].add(mdp.probabilities[state, action])
-        .at[mdp.successors[state, predicted]].add(-mdp.probabilities[state, predicted])
-    )  # fmt: skip
+        .at[mdp.successors[state, action]]
+        .add(mdp.probabilities[state, action])
+        .at[mdp.successors[state, predicted]]
+        .add(-mdp.probabilities[state, predicted])
+    )
     later = jnp.einsum("sa,sak->k", occupancy(mdp, policy, apart), mdp.features)
     now = mdp.features[state, action] - mdp.features[state, predicted]
     return Correction(now + mdp.discount * later, predicted != action)
 
 
 def jin_i2rl(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner:
-    """Jin et al.'s online IRL: a reward table over states, corrected by each pair that was predicted wrongly.
+    """Build Jin et al.'s online IRL: a reward table over states, corrected by each wrong prediction.
 
-    A session of one pair is the method's own (section 3.2); a demonstration of several steps is gone
-    through pair by pair, with the same result as a session each. Steps that are not seen in full, state and
-    action, say nothing here and are passed over: the method is one for full observability. The reward
-    starts at ``1 / sqrt(S)`` in every state, where all actions are worth the same. The prediction is
-    therefore *one* optimal action, the first of the MDP, and any other is a mistake: were ties forgiven,
-    the first reward would never be left.
+    A session of one pair is the method's own (section 3.2); a demonstration of several steps is processed
+    pair by pair, with the same result as a session each. Partly hidden steps are skipped: the method assumes
+    full observability. The reward starts at ``1 / sqrt(S)`` in every state, where all actions have one value.
+    The prediction is therefore *one* optimal action, the first of the MDP, and any other is a mistake: if
+    ties counted as right, the first reward would never change.
 
     ``learner.mdp`` is :func:`with_state_features` of ``mdp``, of which ``weights`` are the reward table.
-    All that ``alpha`` does is to scale that table: what is added sums to zero and depends on the policy
-    alone, and neither a constant nor the scale changes a policy. No learning rate is better than another
-    (up to the tolerance of ties).
+    ``alpha`` only scales that table: corrections sum to zero and depend on the policy alone, and neither a
+    constant nor the scale changes a policy. All learning rates are equivalent (up to the tolerance of ties).
 
     Parameters
     ----------
@@ -117,10 +117,10 @@ def jin_i2rl(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner:
     Returns
     -------
     Learner
-        In its reports ``iterations`` are the pairs looked at, ``solver_iterations`` the mistakes among them
-        and ``gradient`` is ``|sum v_i|``; likelihoods are NaN, as the method states no probabilities. Its
-        ``update`` raises :class:`DemonstrationError` naming trajectory and step for an action that its
-        state does not have; in a fleet such a session changes nothing and reports minus infinity.
+        In its info ``iterations`` is the number of pairs, ``solver_iterations`` that of mistakes, and
+        ``gradient`` is ``|sum v_i|``; likelihoods are NaN, as the method has no probabilities. Its ``update``
+        raises :class:`DemonstrationError` naming trajectory and step for an unavailable action; in a fleet
+        such a session changes nothing and its log-likelihood is minus infinity.
 
     Raises
     ------
@@ -131,12 +131,11 @@ def jin_i2rl(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner:
 
 
 def jin_i2rl_with_features(mdp: TabularMDP, *, learning_rate: float = 0.3) -> Learner:
-    """The same corrections to the weights of ``mdp``'s own features; parameters as for :func:`jin_i2rl`.
+    """Build the same corrections on the weights of ``mdp``'s own features; see :func:`jin_i2rl`.
 
-    A control: what the method reaches where the features of the domain are given to it as to the others.
-    Scaled weights (:mod:`~i2rl.models.process.units`) start at ``1 / sqrt(K)``, and corrections are of them,
-    so here the learning rate matters; the default is what ``i2rl run methods`` finds good on the second
-    patrol.
+    It is a control: the method's result if it has the domain's features, as the others do. Scaled weights
+    (:mod:`~i2rl.models.process.units`) start at ``1 / sqrt(K)``, and corrections are of them, so the learning
+    rate matters here; the default is the best of ``i2rl run methods`` on the second patrol.
     """
     return on_scaled_features(mdp, lambda scaled: _learner("Jin et al. with features", scaled, learning_rate))
 

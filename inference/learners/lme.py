@@ -1,8 +1,9 @@
 """Latent maximum-entropy IRL (chapter 4): learning from partly hidden demonstrations, online and in batch.
 
 A session alternates the E-step (completion under the current policy) and the M-step (a maximum-entropy
-program started at the current weights): Algorithm 1, with its sampling carried out exactly and its
-exponentiated gradient, which can express neither negative weights nor a sharper expert, replaced.
+program started at the current weights). It is Algorithm 1 with two replacements: exact expectations instead
+of sampling, and a solver that can express negative weights and any rationality instead of exponentiated
+gradient.
 """
 
 from __future__ import annotations
@@ -50,7 +51,7 @@ from .alternation import (
     relative_change,
 )
 
-# Nats per trajectory and unit of scaled weight. Smaller lets nearly deterministic experts be nearly so.
+# Nats per trajectory and unit of scaled weight. A smaller slack admits nearly deterministic experts.
 DEFAULT_SLACK = 0.002
 # Lemma 2 with eps_s = 0.05 and delta_s = 0.1 for six features (section 7.4.1).
 DEFAULT_DRAWS = 957
@@ -58,7 +59,7 @@ DEFAULT_DRAWS = 957
 
 @shown_briefly
 class LMEState(NamedTuple):
-    """What LME-I2RL carries from session to session (Definition 7).
+    """State that LME-I2RL carries from session to session (Definition 7).
 
     Fields
     ------
@@ -67,11 +68,11 @@ class LMEState(NamedTuple):
     statistic : FeatureStatistic or CountStatistic
         The sufficient statistic, a running average over all trajectories so far.
     values : float ``[S]``
-        Soft values of ``weights``: planning's warm start.
+        Soft values of ``weights``, planning's warm start.
     program : tuple
-        The solver's own warm start, empty for solvers that start from weights and values.
+        The solver's own warm start; empty for solvers that start from weights and values.
     session : int
-        Sessions so far.
+        Number of sessions so far.
     key : random key
     """
 
@@ -110,18 +111,18 @@ def lme_i2rl(
     tolerance: float = 1e-3,
     name: str = "LME-I2RL",
 ) -> Learner:
-    """Online latent maximum-entropy IRL (Algorithm 1).
+    """Build online latent maximum-entropy IRL (Algorithm 1).
 
     Parameters
     ----------
     mdp : TabularMDP
         The expert's process without its reward; discount below 1.
-    sensor : Imperfection
-        What the learner cannot see and what it may misread.
+    sensor : Sensor
+        Visibility and noise of the learner's perception.
     statistic : {"seen", "counts", "features"}
-        What is kept of a session; see :mod:`i2rl.inference.sessions.statistic`.
+        Summary of a session; see :mod:`i2rl.inference.sessions.statistic`.
     completion : {"exact", "blocked", "gibbs"}
-        The E-step: exact, or estimated from ``draws`` samples.
+        The E-step: exact, or estimated from ``draws``.
     solver : {"newton", "ipopt", "cvxpy", "exponentiated gradient"}
         The M-step: proximal Newton in JAX; the CasADi program with IPOPT, warm-started from the last
         session; the CVXPY primal; the normalised exponentiated gradient as printed. The last two solve the
@@ -129,27 +130,26 @@ def lme_i2rl(
     slack : float or function of the session's number
         Relaxation ``epsilon`` of the matching constraint: an L1 penalty of ``slack`` nats per trajectory on
         scaled weights, rewards in nats that each feature adds at most (:mod:`~i2rl.models.process.units`)
-        (``slack / (1 - gamma)`` with the ``features`` statistic, as in Theorem 1). Or a schedule, as in
-        Optax: a function that JAX can trace from the session's number, counted from 1, to it;
+        (``slack / (1 - gamma)`` with the ``features`` statistic, as in Theorem 1). A function is a schedule,
+        as in Optax: JAX traces it from the session's number, counted from 1;
         :class:`~i2rl.inference.sessions.schedule.Harmonic` is that of the no-regret theorem (Eq. 4.3).
     ridge : float
         Precision of a Gaussian prior on the scaled weights (nats in all, not per trajectory); for the newton
         and ipopt solvers.
     iterations, tolerance : int, float
-        A session ends after so many E- and M-steps, or when no scaled weight moves by more than
+        A session ends after this number of E- and M-steps, or when no scaled weight moves by more than
         ``tolerance`` relative to the largest.
 
     Returns
     -------
     Learner
-        Its ``update`` raises :class:`DemonstrationError` naming trajectory and step for an observation the
-        model rules out, and ``ValueError`` where a schedule turns negative; the state it was given stays
-        valid.
+        Its ``update`` raises :class:`DemonstrationError` naming trajectory and step for an impossible
+        observation, and ``ValueError`` if a schedule turns negative; the given state stays valid.
 
     Raises
     ------
     ValueError
-        For discount 1, an unknown option, or a slack that is negative or no number.
+        For discount 1, an unknown option, or a slack that is negative or not a number.
     """
     require_discounted(mdp)
     sensor = fitting_sensor(sensor, mdp)
@@ -157,11 +157,16 @@ def lme_i2rl(
     def build(mdp: TabularMDP) -> Learner:
         method = checked_method(mdp, sensor, statistic, completion, slack, ridge, draws)
         configuration = {
-            "statistic": statistic, "completion": completion, "solver": solver, "slack": described(slack),
+            "statistic": statistic,
+            "completion": completion,
+            "solver": solver,
+            "slack": described(slack),
             "ridge": ridge,
-            "draws": draws if completion != "exact" else 0, "iterations": iterations, "tolerance": tolerance,
+            "draws": draws if completion != "exact" else 0,
+            "iterations": iterations,
+            "tolerance": tolerance,
             "sensor": digest_of(sensor),
-        }  # fmt: skip
+        }
         start = partial(_carried_on, method)
         return _learner(name, method, start, solver, iterations, tolerance, configuration)
 
@@ -169,9 +174,9 @@ def lme_i2rl(
 
 
 def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Learner:
-    """LME-I2RL that forgets its weights: every session starts from fresh random ones (section 7.3).
+    """Build LME-I2RL without carried weights: every session starts from random ones (section 7.3).
 
-    A control for what passing the weights on is worth. Options as for :func:`lme_i2rl`.
+    It is a control for the value of carrying the weights. Options as for :func:`lme_i2rl`.
     """
     sensor = fitting_sensor(sensor, mdp)
     carried = lme_i2rl(mdp, sensor, name="LME-I2RL with random weights", **options)
@@ -179,20 +184,30 @@ def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: AnySensor, **options: 
 
     def build(mdp: TabularMDP) -> Learner:
         method = checked_method(
-            mdp, sensor, configuration["statistic"], configuration["completion"],
-            options.get("slack", DEFAULT_SLACK), configuration["ridge"], configuration["draws"],
-        )  # fmt: skip
+            mdp,
+            sensor,
+            configuration["statistic"],
+            configuration["completion"],
+            options.get("slack", DEFAULT_SLACK),
+            configuration["ridge"],
+            configuration["draws"],
+        )
         start = partial(_started_afresh, method)
         return _learner(
-            carried.name, method, start, configuration["solver"], configuration["iterations"],
-            configuration["tolerance"], configuration,
-        )  # fmt: skip
+            carried.name,
+            method,
+            start,
+            configuration["solver"],
+            configuration["iterations"],
+            configuration["tolerance"],
+            configuration,
+        )
 
     return on_scaled_features(mdp, build)
 
 
 def me_i2rl(mdp: TabularMDP, **options: Any) -> Learner:
-    """Online maximum-entropy IRL under full observability; options as for :func:`lme_i2rl`.
+    """Build online maximum-entropy IRL under full observability; options as for :func:`lme_i2rl`.
 
     Theorem 1 is about the program that ``statistic="features"`` solves.
     """
@@ -233,7 +248,7 @@ def _em(
     weights: Float[Array, " K"],
     values: Float[Array, " S"],
 ) -> _Ending:
-    """E- and M-steps of the session with this number in one compiled loop, and one more E-step."""
+    """Run the E- and M-steps of the session with this number in one compiled loop, and one more E-step."""
 
     @jax.jit  # traced once, though its shapes are asked for below
     def complete_under(point: _Iterate) -> tuple[Array, SoftPlan, Completed]:
@@ -250,10 +265,15 @@ def _em(
             point.iterations == 0, lambda: method.gradient(plan, working), lambda: point.gradient
         )
         return _Iterate(
-            solution.weights, solution.values, relative_change(point.weights, solution.weights), gradient,
-            point.iterations + 1, point.solver_iterations + solution.iterations, solution.converged,
+            solution.weights,
+            solution.values,
+            relative_change(point.weights, solution.weights),
+            gradient,
+            point.iterations + 1,
+            point.solver_iterations + solution.iterations,
+            solution.converged,
             point.key,
-        )  # fmt: skip
+        )
 
     # The last E-step is one more turn of the loop: it would otherwise be compiled a second time.
     def step(now: _Ending) -> _Ending:
@@ -276,7 +296,7 @@ def _em(
 def _close(
     method: Method, state: LMEState, point: _Iterate, program: Any, plan: SoftPlan, completed: Completed
 ) -> tuple[LMEState, SessionInfo]:
-    """End a session: keep the statistic of its demonstration, completed under its own result."""
+    """End a session: update the statistic by its demonstration, completed under its own result."""
     mdp, statistic = method.mdp, method.statistic
     new = statistic.to_keep(mdp, plan, completed)
     own = jnp.sum(completed.expectations.log_likelihood)
@@ -293,7 +313,7 @@ def _close(
         "weights": point.weights,
     }
     learned = LMEState(point.weights, kept, plan.values, program, state.session + 1, point.key)
-    # An observation that cannot be must not spoil what was learned (a fleet raises nothing).
+    # Keep the previous state if the observation has probability zero; compiled fleets cannot raise.
     possible = jnp.isfinite(own)
     state = jax.tree.map(partial(jnp.where, possible), learned, state._replace(program=program))
     return state, SessionInfo(**fields)
@@ -381,7 +401,7 @@ def _learner(
                 key, values, own, gradient, working, slack, ridge = expectation(
                     state._replace(program=()), key, weights, values, evidence, seen
                 )
-                if not np.isfinite(own):  # no program to solve: update says which step cannot be
+                if not np.isfinite(own):  # no program to solve: update names the impossible step
                     break
                 first = gradient if steps == 0 else first
                 solution, program = solve(working, slack, ridge, program)
@@ -448,15 +468,15 @@ class BatchFit(NamedTuple):
     Fields
     ------
     weights : float ``[K]``
-        Of the best restart.
+        Weights of the best restart.
     log_likelihood : float
         Exact log-likelihood of the demonstration, nats per trajectory.
     objective : float ``[restarts]``
-        Penalised log-likelihood (per trajectory) reached from each start.
+        Penalised log-likelihood (per trajectory) at the end of each restart.
     iterations : int ``[restarts]``
-        E- and M-steps of each.
+        E- and M-steps of each restart.
     converged : bool ``[restarts]``
-        Whether each one's last program met its tolerance.
+        True if the restart's last program met its tolerance.
     """
 
     weights: Float[np.ndarray, " K"]
@@ -484,10 +504,10 @@ def batch_lme(
     iterations: int = 500,
     tolerance: float = 1e-3,
 ) -> Batch:
-    """Batch latent maximum-entropy IRL: EM over all trajectories from several random starts, best one kept.
+    """Build batch latent maximum-entropy IRL: EM over all trajectories from random starts; the best wins.
 
-    Parameters as for :func:`lme_i2rl`, but without sessions ``slack`` is a number. ``fit`` raises
-    :class:`DemonstrationError` for an observation the model rules out.
+    Parameters as for :func:`lme_i2rl`, except that ``slack`` is a number. ``fit`` raises
+    :class:`DemonstrationError` for an impossible observation.
     """
     require_discounted(mdp)
     if restarts < 1 or iterations < 1:

@@ -1,8 +1,8 @@
-"""Maximum-likelihood IRL of Boltzmann experts, of one task and of several.
+"""Maximum-likelihood IRL of Boltzmann experts, with one reward function or several.
 
-MLIRL (Vroman 2014) climbs the Boltzmann likelihood of the demonstration; EM-MLIRL (Babes-Vroman et al. 2011)
-is a mixture of as many such experts as one says, fitted by expectation-maximisation. The likelihood is
-linear in the visits, so a cluster's M-step is MLIRL on the visits weighted by the responsibilities.
+MLIRL (Vroman 2014) climbs the Boltzmann likelihood of the demonstration. EM-MLIRL (Babes-Vroman et al. 2011)
+is a mixture of a given number of such experts, fitted by expectation-maximisation. The likelihood is linear
+in the visits, so a component's M-step is MLIRL on the visits weighted by the responsibilities.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ class MLIRLFit(NamedTuple):
     Fields
     ------
     weights : float ``[K]``
-        Of the best start; scaled weights lie in ``[-1, 1]``.
+        Weights of the best start; scaled weights lie in ``[-1, 1]``.
     log_likelihood : float
-        Of the whole demonstration, in nats, transition probabilities left out.
+        Log-likelihood of the whole demonstration, in nats, without transition probabilities.
     objective : float ``[restarts]``
-        Log-likelihood reached from each start.
+        Log-likelihood at the end of each start.
     iterations : int ``[restarts]``
-        Points evaluated on the way.
+        Number of evaluations of each start.
     """
 
     weights: Float[np.ndarray, " K"]
@@ -59,7 +59,7 @@ class MLIRLFit(NamedTuple):
 
 @shown_briefly
 class Ascent(NamedTuple):
-    """A point of the projected gradient ascent: value and gradient there, and the step to try next."""
+    """Point of the projected gradient ascent: value and gradient there, and the step to try next."""
 
     weights: Float[Array, " K"]
     value: Float[Array, ""]
@@ -78,8 +78,8 @@ def ascend(
 ) -> Ascent:
     """Climb ``sum N(s, a) log pi(a | s)`` by gradient ascent projected on the box; traceable.
 
-    The step grows while it succeeds and halves when it does not (Armijo's condition), so the value never
-    falls; ends when a step would move no weight by ``tolerance``.
+    The step grows after success and halves after failure (Armijo's condition), so the value never falls;
+    it ends when a step would move no weight by ``tolerance``.
     """
 
     @jax.value_and_grad
@@ -104,7 +104,7 @@ def ascend(
 
     value, gradient = objective(start)
     first = Ascent(start, value, gradient, jnp.ones(()), jnp.zeros((), int))
-    # A first step of a tenth of the box, whatever the amount of data.
+    # The first step is a tenth of the box, whatever the amount of data.
     first = first._replace(step=0.2 * BOX / jnp.maximum(reach(first), 1e-12))
     return lax.while_loop(unfinished, attempt, first)
 
@@ -128,28 +128,28 @@ def mlirl(
     restarts: int = 5,
     iterations: int = 300,
 ) -> MLIRLFit:
-    """Maximum-likelihood IRL: the weights under which the demonstration is likeliest.
+    """Find the weights of maximum likelihood of the demonstration.
 
-    Scaled weights (:mod:`~i2rl.models.process.units`) are looked for in ``[-1, 1]^K``.
+    Scaled weights (:mod:`~i2rl.models.process.units`) are restricted to ``[-1, 1]^K``.
 
     Parameters
     ----------
     key : JAX random key
-        Of the starts, uniform on the box.
+        Key of the starts, uniform on the box.
     mdp, demonstration
         The decision process; its demonstration, every step seen.
     rationality : float
         Inverse temperature of the expert, per unit of value.
     restarts, iterations : int
         Starts, and evaluations from each at most. The likelihood has several local maxima, and ridges
-        (where the greedy policy changes) on which gradient ascent may rest; the best start is returned.
+        (where the greedy policy changes) on which gradient ascent may stop; the best start is returned.
 
     Raises
     ------
     DemonstrationError
-        Naming trajectory and step, for a step that was not seen or that is impossible.
+        Naming trajectory and step, for a step that was hidden or that is impossible.
     ValueError
-        For an ``rationality``, ``restarts`` or ``iterations`` that is not positive, or an undiscounted MDP.
+        For a ``rationality``, ``restarts`` or ``iterations`` that is not positive, or an undiscounted MDP.
     """
     require_discounted(mdp)
     require_positive(rationality=rationality, restarts=restarts, iterations=iterations)
@@ -168,11 +168,10 @@ def mlirl(
 
 
 def require_components(n_components: int, trajectories: int) -> None:
-    """Raise ``ValueError`` if there are fewer trajectories than clusters to put them in."""
+    """Raise ``ValueError`` if there are fewer trajectories than components."""
     if n_components > trajectories:
         raise ValueError(
-            f"{n_components} components were asked for, but the demonstration has {trajectories} "
-            f"{'trajectory' if trajectories == 1 else 'trajectories'}: every cluster needs at least one"
+            f"`n_components` must be at most the number of trajectories, {trajectories}; got {n_components}"
         )
 
 
@@ -189,12 +188,12 @@ class Mixture(NamedTuple):
 
 @shown_briefly
 class EMTrace(NamedTuple):
-    """All that an EM fit computed.
+    """Full result of an EM fit.
 
     Fields
     ------
     clustering : Clustering
-        Of the best start; its ``objective`` is the marginal log-likelihood.
+        Clustering of the best start; its ``objective`` is the marginal log-likelihood.
     log_likelihoods : float ``[restarts, iterations + 1]``
         Marginal log-likelihood of the demonstration at the start and after each iteration, in nats.
     """
@@ -218,7 +217,7 @@ class EMMLIRL(NamedTuple):
 def component_log_likelihoods(
     mdp: TabularMDP, weights: Float[Array, "D K"], counts: Float[Array, "n S A"], rationality: float | Array
 ) -> Float[Array, "n D"]:
-    """Log-likelihood of every trajectory under every cluster's weights; traceable."""
+    """Return the log-likelihood of every trajectory under every component's weights; traceable."""
 
     def one(theta: Float[Array, " K"]) -> Float[Array, " n"]:
         return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, theta, rationality), counts)
@@ -227,7 +226,7 @@ def component_log_likelihoods(
 
 
 def _e_step(mdp: TabularMDP, mixture: Mixture, counts: Float[Array, "n S A"], rationality: Array) -> tuple:
-    """Responsibilities ``[n, D]`` and the marginal log-likelihood."""
+    """Return responsibilities ``[n, D]`` and the marginal log-likelihood."""
     joint = jnp.log(mixture.proportions) + component_log_likelihoods(
         mdp, mixture.weights, counts, rationality
     )
@@ -275,30 +274,30 @@ def em_mlirl(
     restarts: int = 1,
     ascents: int = 30,
 ) -> EMMLIRL:
-    """EM over a mixture of Boltzmann experts, their number given (Babes-Vroman et al. 2011).
+    """Build EM for a mixture of Boltzmann experts of known number (Babes-Vroman et al. 2011).
 
-    Responsibilities ``v_{d,i} ~ rho_d prod_t pi_eta(a_t | s_t; theta_d)``; proportions are their means;
-    weights climb the responsibility-weighted log-likelihood from where they were, so the marginal
-    log-likelihood never falls. Starts: weights uniform on the box, equal proportions. The box ``[-1, 1]^K``
-    is of scaled weights (:mod:`~i2rl.models.process.units`).
+    Responsibilities are ``v_{d,i} ~ rho_d prod_t pi_rationality(a_t | s_t; theta_d)``; proportions are their
+    means. Weights climb the responsibility-weighted log-likelihood from their previous values, so the
+    marginal log-likelihood never falls. Starts: weights uniform on the box, equal proportions. The box
+    ``[-1, 1]^K`` is of scaled weights (:mod:`~i2rl.models.process.units`).
 
     Parameters
     ----------
     mdp : TabularMDP
     n_components : int
-        Number of ways, ``D``.
+        Number of components, ``D``.
     rationality : float
         Inverse temperature of the experts, per unit of value.
     iterations, restarts : int
-        EM iterations, and starts of which the likeliest is kept.
+        EM iterations, and number of starts; the likeliest is returned.
     ascents : int
-        Gradient evaluations of each cluster in an M-step, at most.
+        Gradient evaluations of each component in an M-step, at most.
 
     Returns
     -------
     EMMLIRL
-        ``fit`` raises ``ValueError`` for more n_components than trajectories, and ``DemonstrationError``
-        naming trajectory and step for one that was not seen or that is impossible.
+        ``fit`` raises ``ValueError`` for more components than trajectories, and ``DemonstrationError``
+        naming trajectory and step for one that was hidden or that is impossible.
 
     Raises
     ------
@@ -321,9 +320,15 @@ def em_mlirl(
         # Rows of padding would count for the proportions.
         real = demonstration.lengths > 0
         mixtures, responsibilities, history = _em(
-            as_key(key), scaled, jnp.asarray(counts[real]), jnp.asarray(float(rationality)),
-            n_components, restarts, iterations, ascents,
-        )  # fmt: skip
+            as_key(key),
+            scaled,
+            jnp.asarray(counts[real]),
+            jnp.asarray(float(rationality)),
+            n_components,
+            restarts,
+            iterations,
+            ascents,
+        )
         best = int(np.argmax(history[:, -1]))
         proportions = np.asarray(responsibilities[best]).mean(0)
         rows = np.broadcast_to(proportions, (len(real), n_components)).copy()

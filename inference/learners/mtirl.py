@@ -1,8 +1,8 @@
-"""Min-max-entropy multi-task IRL (chapter 5): several ways of doing a task, from one jumble of trajectories.
+"""Min-max-entropy multi-task IRL (chapter 5): several reward functions from one demonstration.
 
-Batch and online. How many ways there are, who did what, and the reward of each are learned together, by
+Batch and online. The number of components, the assignments, and the reward of each are learned together, by
 the alternation of :mod:`~i2rl.inference.mixtures.fit`; :mod:`~i2rl.inference.programs.minmax` poses the same
-program as one. The gradient for the assignments that the dissertation prints cannot cluster:
+program as one. The dissertation's printed gradient of the assignments cannot separate trajectories:
 :mod:`~i2rl.inference.programs.printed.minmax` shows it.
 """
 
@@ -50,21 +50,21 @@ from ..sessions.scaling import on_scaled_features
 
 DEFAULT_COMPONENTS = 4
 DEFAULT_RESTARTS = 4
-# Experts are decided: a prior of scale 7 on each weight admits one who errs once in a thousand choices.
+# Experts are nearly deterministic: a prior of scale 7 on each weight admits one error in a thousand choices.
 DEFAULT_RIDGE = 0.02
 _FEWEST_ROWS = 32
 
 
 @shown_briefly
 class MixtureState(NamedTuple):
-    """What online MME-MTIRL carries from session to session (section 5.2). Empty slots have no mass.
+    """State that online MME-MTIRL carries from session to session (section 5.2). Empty slots have no mass.
 
     Fields
     ------
     weights : float ``[D, K]``
-        Reward weights of each way, ``theta_d``.
+        Reward weights of each component, ``theta_d``.
     values : float ``[D, S]``
-        Their soft values: planning's warm start.
+        Their soft values, planning's warm start.
     proportions : float ``[D]``
         Mixture weights ``pi_d``.
     mass : float ``[D]``
@@ -73,7 +73,7 @@ class MixtureState(NamedTuple):
         ``sum_i v_{d,i} N_i(s, a)``, visits of seen steps. ``|X| phi_hat_d`` of Eq. 5.8 is its product with
         the features; adding to the two sums is Eq. 5.7 and 5.8.
     session : int
-        Sessions so far.
+        Number of sessions so far.
     key : random key
     """
 
@@ -88,32 +88,33 @@ class MixtureState(NamedTuple):
 
 @shown_briefly
 class MixtureInfo(NamedTuple):
-    """What a session did; fields as in :class:`~i2rl.inference.SessionInfo`, where not said otherwise.
+    """Measures of a session; fields as in :class:`~i2rl.inference.SessionInfo`, unless stated otherwise.
 
     Fields
     ------
     session : int
     log_likelihood : float
-        Of all that is kept, in nats per trajectory, dynamics left out: each trajectory under its own way,
-        and of the way under the proportions.
+        Log-likelihood of the carried statistic, in nats per trajectory, without dynamics: each trajectory
+        under its own component, and the component under the proportions.
     demonstration_log_likelihood : float
         Exact log-likelihood of this session's trajectories under the mixture, dynamics included.
     gradient : float
-        Norm over all ways of the log-likelihood's gradient in scaled weights at those the session began with.
+        Norm over all components of the log-likelihood's gradient in scaled weights, at the session's first
+        weights.
     iterations, solver_iterations : int
-        Of the alternation and of the programs' solver, in the start that was kept.
+        Iterations of the alternation and of the programs' solver, in the selected start.
     converged : bool
-        Whether the programs of its last alternation met their tolerances.
+        True if the programs of its last alternation met their tolerances.
     seconds : float
     weights : float ``[D, K]``
     proportions : float ``[D]``
         Zero for empty slots.
     n_components : int
-        How many there are now.
+        Number of components now.
     starts : int
-        How many starts were tried; one when nothing suggested a new way.
+        Number of starts tried; one if no new component could pay.
     assignments : int ``[n]``
-        The likeliest way of each of this session's trajectories.
+        The likeliest component of each of this session's trajectories.
     responsibilities : float ``[n, D]``
     """
 
@@ -146,45 +147,46 @@ def mme_mtirl(
     iterations: int = 50,
     tolerance: float = 1e-6,
 ) -> Learner:
-    """Online MME-MTIRL: a session learns from its own trajectories and the statistic of earlier ones (5.2).
+    """Build online MME-MTIRL: a session learns from its trajectories and the statistic of earlier ones (5.2).
 
-    A session first explains its trajectories by the ways known so far. Where that is so bad that a new way
-    could pay for itself, the empty slots are tried too, so that a way that first appears late is found.
+    A session first explains its trajectories by the known components. If their fit is so bad that a new
+    component could pay for itself, the empty slots are tried too, so that a component that appears late is
+    found.
 
     Parameters
     ----------
     mdp : TabularMDP
         The task without its reward; discount below 1.
     sensor : Imperfection, optional
-        What is hidden or misread; without it everything is seen.
+        Visibility and noise; without it everything is seen.
     n_components : int
-        Most ways there can be at a time, ``D``.
+        Largest number of components at a time, ``D``.
     strength : float
         ``lambda`` of the entropic prior on the proportions, ``exp(-lambda H(pi))``: the min-entropy half of
         program (5.1). The dissertation's is 1.
     temperature : float
-        What a nat of information of who did what costs, in nats of likelihood; see
-        :mod:`~i2rl.inference.mixtures.fit`. 1 is the likelihood's own price, right for people who err; less
-        prefers several decided ways to one undecided.
+        Weight of a nat of the assignments' entropy, in nats of likelihood; see
+        :mod:`~i2rl.inference.mixtures.fit`. With 0.5 (the default) the mixture prefers several deterministic
+        experts to one stochastic expert; use 1 (the likelihood itself) for stochastic experts.
     slack, ridge : float
         Rate of a Laplace and precision of a Gaussian prior on each scaled weight (nats in all, not per
         trajectory), the reward in nats that a feature adds at most (:mod:`~i2rl.models.process.units`).
     restarts : int
-        Seedings of the empty slots that are tried.
+        Number of seedings of the empty slots.
     iterations, tolerance : int, float
-        A climb ends after so many alternations, or when one gains less than ``tolerance`` nats.
+        A climb ends after this number of alternations, or when one gains less than ``tolerance`` nats.
 
     Returns
     -------
     Learner
-        ``update(state, demonstration)`` gives a :class:`MixtureState` and a :class:`MixtureInfo`. Raises
-        :class:`DemonstrationError` naming trajectory and step for what the model rules out, an action that
-        is not available in its state among it; the state it was given stays valid.
+        ``update(state, demonstration)`` returns a :class:`MixtureState` and a :class:`MixtureInfo`. It raises
+        :class:`DemonstrationError` naming trajectory and step for an impossible observation, an unavailable
+        action included; the given state stays valid.
 
     Raises
     ------
     ValueError
-        For discount 1, fewer than one way, or settings that are negative or not finite.
+        For discount 1, fewer than one component, or settings that are negative or not finite.
     """
     sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
 
@@ -193,11 +195,16 @@ def mme_mtirl(
             mdp, n_components, strength, temperature, slack, ridge, restarts, iterations, tolerance
         )
         configuration = {
-            "n_components": n_components, "strength": strength, "temperature": temperature, "slack": slack,
+            "n_components": n_components,
+            "strength": strength,
+            "temperature": temperature,
+            "slack": slack,
             "ridge": ridge,
-            "restarts": restarts, "iterations": iterations, "tolerance": tolerance,
+            "restarts": restarts,
+            "iterations": iterations,
+            "tolerance": tolerance,
             "sensor": digest_of(sensor),
-        }  # fmt: skip
+        }
         return _learner(program, sensor, n_components, restarts, configuration)
 
     return on_scaled_features(mdp, build)
@@ -273,11 +280,11 @@ def batch_mme_mtirl(
     iterations: int = 50,
     tolerance: float = 1e-6,
 ) -> BatchMixture:
-    """Make batch MME-MTIRL (section 5.1): the alternation from several seedings, best one kept.
+    """Build batch MME-MTIRL (section 5.1): the alternation from several seedings; the best is returned.
 
-    Parameters as for :func:`mme_mtirl`. The :class:`Clustering` has the ways that were found, the largest
-    first, and the min-max-entropy program's objective ``J``. With fewer trajectories than ``n_components``,
-    there is a warning, and at most one way a trajectory. ``fit`` raises :class:`DemonstrationError` as
+    Parameters as for :func:`mme_mtirl`. The :class:`Clustering` has the components, the largest first, and
+    the min-max-entropy program's objective ``J``. With fewer trajectories than ``n_components`` there is a
+    warning, and at most one component per trajectory. ``fit`` raises :class:`DemonstrationError` as
     :func:`mme_mtirl` does.
     """
     sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
@@ -314,7 +321,7 @@ def batch_mme_mtirl(
 
 
 def clustering_of(state: MixtureState, info: MixtureInfo) -> Clustering:
-    """What an online learner has found, with the assignments of its last session; largest way first."""
+    """Return the components of an online learner, largest first, with its last session's assignments."""
     proportions = np.asarray(state.proportions)
     order = np.argsort(-proportions, kind="stable")[: np.count_nonzero(proportions)]
     return Clustering(
@@ -332,11 +339,11 @@ def assign_trajectories(
     proportions: Float[np.ndarray, " D"],
     demonstration: Demonstration,
 ) -> Float[np.ndarray, "n D"]:
-    """Probability that each trajectory was done in each of these ways, hidden steps summed out.
+    """Return the probability of each component for each trajectory, hidden steps summed out.
 
-    By Bayes' rule alone (price 1), for any trajectories. Raises as :func:`mme_mtirl`'s ``update`` does, and
-    ``ValueError`` for weights that are not finite, proportions that are negative or all zero, or shapes that
-    do not fit.
+    It is Bayes' rule (temperature 1), for any trajectories. Raises as :func:`mme_mtirl`'s ``update`` does,
+    and ``ValueError`` for weights that are not finite, proportions that are negative or all zero, or shapes
+    that do not fit.
     """
     weights, proportions = np.asarray(weights, float), np.asarray(proportions, float)
     if weights.shape != (*proportions.shape, mdp.n_features) or weights.ndim != 2:
@@ -399,9 +406,15 @@ def _program(
     if np.isnan(tolerance):
         raise ValueError("tolerance must be a number of nats, got nan")
     if temperature == 0:
-        raise ValueError("temperature must be more than zero: every trajectory would be a way of its own")
+        raise ValueError(
+            "temperature must be more than zero: with 0 every trajectory would be its own component"
+        )
     reachable = jnp.asarray(reachable_states(mdp))
-    return MixtureProgram(mdp, reachable, strength, slack, ridge, temperature, iterations, tolerance)
+    # Of one type whatever was given: 1 and 1.0 are different programs to the compiler.
+    strength, slack, ridge, temperature = (float(x) for x in (strength, slack, ridge, temperature))
+    return MixtureProgram(
+        mdp, reachable, strength, slack, ridge, temperature, int(iterations), float(tolerance)
+    )
 
 
 _seen_whole, _seen_in_part = jax.jit(seen_whole), jax.jit(seen_in_part)
@@ -418,7 +431,7 @@ def _gather(mdp: TabularMDP, sensor: AnySensor, demonstration: Demonstration) ->
 
 def _explain_impossible(sensor: AnySensor, mdp: TabularMDP, demonstration: Demonstration) -> None:
     require_possible(sensor, mdp, demonstration)
-    raise DemonstrationError("a trajectory has probability zero under every way of doing the task")
+    raise DemonstrationError("a trajectory has probability zero under every component")
 
 
 # Compiled once for all learners of one shape of problem, batch and online.
@@ -441,7 +454,7 @@ def _begin(
 def _kept_log_likelihood(
     mdp: TabularMDP, state: MixtureState, weights: Float[Array, "D K"]
 ) -> Float[Array, ""]:
-    """Of all that is kept, under these weights and the state's proportions, in nats per trajectory."""
+    """Return the carried statistic's log-likelihood under these weights, in nats per trajectory."""
     policies, _ = log_policies(mdp, weights, state.values)
     done = jnp.sum(state.visits * jnp.where(mdp.available, policies, 0.0))
     chosen = state.mass @ jnp.log(jnp.where(state.proportions > 0, state.proportions, 1.0))
@@ -476,7 +489,7 @@ def _conclude(
         "assignments": jnp.argmax(fit.responsibilities, axis=1),
         "responsibilities": fit.responsibilities,
     }
-    # An observation that cannot be must not spoil what was learned (a fleet raises nothing).
+    # Keep the previous state if the observation has probability zero; compiled fleets cannot raise.
     possible = jnp.isfinite(own)
     return jax.tree.map(partial(jnp.where, possible), learned, state), MixtureInfo(**fields)
 

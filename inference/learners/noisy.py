@@ -1,10 +1,10 @@
-"""Learning through noisy perception whose noise is not known: RIMEO (chapter 6.1), and its controls.
+"""Learning under unknown noise of the sensor: RIMEO (chapter 6.1), and its controls.
 
-A session alternates three steps: the posterior over the truth behind every report, under the present reward
-and the present reliabilities; the maximum-entropy observation program, whose expected agreement is that
-posterior's; the maximum-entropy program of the reward. With a posterior in the place of the "estimated
-ground truth" of Eq. 6.7 this is expectation-maximisation of the reports' likelihood. What is kept are
-running averages (Eq. 6.9): expected visits, and expected agreement of reports with truths.
+A session alternates three steps: the posterior over the truth behind every observation, under the current
+reward and reliabilities; the maximum-entropy observation program, whose expected agreement is that
+posterior's; the maximum-entropy program of the reward. With a posterior instead of the "estimated ground
+truth" of Eq. 6.7 this is expectation-maximisation of the observations' likelihood. Sessions carry running
+averages (Eq. 6.9): expected visits, and expected agreement of observations with truths.
 """
 
 from __future__ import annotations
@@ -61,34 +61,34 @@ from .lme import Batch, batch_lme
 Scores = Literal["stepwise", "averaged", "none"]
 Truths = Literal["posterior", "observed", "oracle", "all"]
 
-# Nats in all. Rewards that grow early decide what early reports are taken for.
+# Nats in all. Rewards that grow early bias the interpretation of early observations.
 DEFAULT_RIDGE = 0.05
-# Reports in all, per predicate: agreement is learned as if a quarter of a report had been wrong.
+# Number of observations, per predicate: agreement is learned as if a quarter of one had been wrong.
 DEFAULT_ERRORS = 0.25
-# Sessions are small: of each, one or two alternations are enough, and more make too much of its guesses.
+# Sessions are small: one or two alternations are enough for each, and more overfit their completions.
 DEFAULT_ITERATIONS = 2
-# Exponent by which early guesses are forgotten.
+# Exponent of forgetting early completions.
 DEFAULT_FORGETTING = 0.8
-# How often a predicate is thought to be reported rightly before the first session.
+# Assumed agreement of a predicate before the first session.
 DEFAULT_START = 0.75
 
 
 @shown_briefly
 class RIMEOState(NamedTuple):
-    """What RIMEO carries from session to session: ``(|Xi|, P*, phi_hat)`` and the reward.
+    """State that RIMEO carries from session to session: ``(|Xi|, P*, phi_hat)`` and the reward.
 
     Fields
     ------
     weights : float ``[K]``
         The reward estimate.
     statistic : CountStatistic or FeatureStatistic
-        Of the truths behind the reports.
+        Statistic of the truths behind the observations.
     values : float ``[S]``
-        Soft values of ``weights``: planning's warm start.
+        Soft values of ``weights``, planning's warm start.
     logits : float ``[J]``
-        Of the reliabilities ``P*``.
+        Logits of the reliabilities ``P*``.
     reports : ReportStatistic or FrequencyStatistic
-        Of the reports.
+        Statistic of the observations.
     program : tuple
         Warm starts of solvers outside JAX.
     session : int
@@ -107,14 +107,14 @@ class RIMEOState(NamedTuple):
 
 @shown_briefly
 class RIMEOInfo(NamedTuple):
-    """Numbers of a session, those of :class:`~i2rl.inference.SessionInfo` and of the sensor that was learned.
+    """Measures of a session, those of :class:`~i2rl.inference.SessionInfo` and of the learned sensor.
 
     Fields
     ------
     reliabilities : float ``[J]``
         ``p_j`` of Eq. 6.5: parameters, not frequencies.
     agreement : float ``[J]``
-        How often each predicate of a report is expected to be that of the truth, over all reports so far.
+        Expected agreement of each predicate with the truth, over all observations so far.
     """
 
     session: int
@@ -150,54 +150,54 @@ def rimeo(
     tolerance: float = 1e-3,
     names: tuple[str, ...] | None = None,
 ) -> Learner:
-    """Online IRL through perception whose noise is learned, too (Algorithm 2).
+    """Build online IRL that also learns the sensor's noise (Algorithm 2).
 
     Parameters
     ----------
     mdp : TabularMDP
-        The expert's process without its reward; discount below 1. Its start distribution matters: it is what
-        the first report of a trajectory is weighed against.
+        The expert's process without its reward; discount below 1. Its start distribution matters: it is the
+        prior of a trajectory's first observation.
     predicates : bool or int ``[J, S, A]``
-        Features of a pair that perception may get wrong. What counts is whether a report has the same value
-        as the truth, so a feature may be a label, such as the state: perception that is known by predicates
-        alone is thought to mix up all that they do not tell apart.
-    view : Imperfection, optional
-        What is hidden (a ``Visibility``); everything is in view by default.
+        Features of a pair that perception may get wrong. Only the equality of an observation's and the
+        truth's value counts, so a feature may be a label, such as the state. With predicates alone,
+        perception may confuse all pairs that they do not distinguish.
+    view : Sensor, optional
+        A ``Visibility``; everything is in view by default.
     reportable : bool ``[S, A]``, optional
-        Which pairs perception may report; all by default.
+        Pairs that perception may report; all by default.
     scores : {"stepwise", "averaged", "none"}
-        Perception's probability of being right enters step by step, as the running average of each reported
-        pair (Eq. 6.6), or not at all. An average forgets which report was the doubtful one, so the first is
+        Perception's probability of being right enters step by step, as the running average of each observed
+        pair (Eq. 6.6), or not at all. An average does not say which observation was doubtful, so the first is
         the default.
     truths : {"posterior", "observed", "oracle", "all"}
-        What reports are compared with: the posterior over the truth; the report itself; what happened
-        (sessions must then be :class:`WithTruth`); every pair alike, as Eq. 6.7 is printed.
+        Truths to compare observations with: the posterior over the truth; the observation itself; the actual
+        truth (sessions must then be :class:`WithTruth`); every pair alike, as Eq. 6.7 is printed.
     unscored : bool
-        Allow reports without a score where ``scores`` are used: they tell of agreement as all reports do with
-        ``scores="none"``.
+        Allow observations without a score if ``scores`` are used: they inform agreement as all observations
+        do with ``scores="none"``.
     solver : {"newton", "ipopt"}
         Both programs in compiled JAX, or in CasADi, each started from its last solution.
     statistic, slack, ridge
         As for :func:`~i2rl.inference.lme_i2rl`.
     errors : float
-        Slack of the observation program: expected agreement may be off by ``errors`` reports in all. It keeps
-        a predicate that was never seen wrong from being thought infallible.
+        Slack of the observation program: expected agreement may be off by this number of observations in all.
+        It keeps the reliability of a predicate that was never wrong below one.
     start : float or float ``[J]``
-        How often predicates are thought to be right before the first session.
+        Assumed agreement of the predicates before the first session.
     forgetting : float
-        Exponent with which earlier sessions are kept, see :func:`~i2rl.inference.sessions.statistic.blend`.
+        Exponent of the weight of earlier sessions, see :func:`~i2rl.inference.sessions.statistic.blend`.
     iterations, tolerance : int, float
-        A session ends after so many alternations, or when no weight (relative to the largest) and no
+        A session ends after this number of alternations, or when no weight (relative to the largest) and no
         agreement moves by more than ``tolerance``.
     names : tuple of str, optional
-        Of the predicates, for messages.
+        Names of the predicates, for messages.
 
     Returns
     -------
     Learner
-        Its ``update`` gives a :class:`RIMEOState` and a :class:`RIMEOInfo`. It raises
-        :class:`DemonstrationError` naming trajectory and step for a report no truth could give, and for a
-        score that is missing or outside [0, 1]; the state it was given stays valid.
+        Its ``update`` returns a :class:`RIMEOState` and a :class:`RIMEOInfo`. It raises
+        :class:`DemonstrationError` naming trajectory and step for an impossible observation, and for a score
+        that is missing or outside [0, 1]; the given state stays valid.
 
     Raises
     ------
@@ -207,7 +207,7 @@ def rimeo(
     Warns
     -----
     UserWarning
-        Naming predicates that are the same for everything that can be reported, and so say nothing.
+        Naming predicates with one value on all reportable pairs, which carry no information.
     """
     seen = _checked_view(mdp, view, slack)
     psi = _checked_predicates(mdp, predicates, reportable, names)
@@ -231,20 +231,39 @@ def rimeo(
         program = ObservationProgram(psi, reportable) if solver == "ipopt" else None
         perception = entropic_perception(classes, scores, truths, errors, forgetting, program)
     configuration = {
-        "scores": scores, "truths": truths, "unscored": unscored, "solver": solver, "statistic": statistic,
-        "slack": described(slack), "ridge": ridge, "errors": errors, "forgetting": forgetting,
-        "start": np.asarray(start, float).tolist(), "iterations": iterations, "tolerance": tolerance,
-        "view": digest_of(seen), "predicates": digest_of(_half_sure(psi, reportable)),
-    }  # fmt: skip
+        "scores": scores,
+        "truths": truths,
+        "unscored": unscored,
+        "solver": solver,
+        "statistic": statistic,
+        "slack": described(slack),
+        "ridge": ridge,
+        "errors": errors,
+        "forgetting": forgetting,
+        "start": np.asarray(start, float).tolist(),
+        "iterations": iterations,
+        "tolerance": tolerance,
+        "view": digest_of(seen),
+        "predicates": digest_of(_half_sure(psi, reportable)),
+    }
     name = "RIMEO" if truths == "posterior" else f"RIMEO ({truths})"
     first_logits = initial_logits(psi, start)
 
     def build(mdp: TabularMDP) -> Learner:
         method = checked_method(mdp, seen, statistic, "exact", slack, ridge, 0)
         return _learner(
-            name, method, perception, _half_sure(psi, reportable), configuration, first_logits,
-            forgetting, iterations, tolerance, solver, scores != "none" and not unscored,
-        )  # fmt: skip
+            name,
+            method,
+            perception,
+            _half_sure(psi, reportable),
+            configuration,
+            first_logits,
+            forgetting,
+            iterations,
+            tolerance,
+            solver,
+            scores != "none" and not unscored,
+        )
 
     return on_scaled_features(mdp, build)
 
@@ -264,11 +283,11 @@ def rifom(
     tolerance: float = 1e-3,
     names: tuple[str, ...] | None = None,
 ) -> Learner:
-    """RIFOM (section 7.3): RIMEO with reliabilities by counting, every report taken for the truth.
+    """Build RIFOM (section 7.3): RIMEO with reliabilities by counting and observations taken for the truth.
 
-    ``form`` is ``"fair"`` (all steps, weighted by scores where there are any, Laplace-smoothed) or
-    ``"coded"`` (as in the released program, see ``coded_perception``;
-    predicates must then be true or false). Other parameters and errors as of :func:`rimeo`.
+    ``form`` is ``"fair"`` (all steps, weighted by scores if there are any, Laplace-smoothed) or ``"coded"``
+    (as in the released program, see ``coded_perception``; predicates must then be true or false). Other
+    parameters and errors as for :func:`rimeo`.
     """
     seen = _checked_view(mdp, view, slack)
     psi = _checked_predicates(mdp, predicates, reportable, names)
@@ -279,27 +298,41 @@ def rifom(
     ways = {"fair": counted_perception, "coded": coded_perception}
     perception = ways[form](report_classes(psi, reportable), psi)
     configuration = {
-        "form": form, "statistic": statistic, "slack": described(slack), "ridge": ridge,
+        "form": form,
+        "statistic": statistic,
+        "slack": described(slack),
+        "ridge": ridge,
         "forgetting": forgetting,
-        "iterations": iterations, "tolerance": tolerance, "view": digest_of(seen),
+        "iterations": iterations,
+        "tolerance": tolerance,
+        "view": digest_of(seen),
         "predicates": digest_of(_half_sure(psi, reportable)),
-    }  # fmt: skip
+    }
     first_logits = initial_logits(psi, DEFAULT_START)
 
     def build(mdp: TabularMDP) -> Learner:
         method = checked_method(mdp, seen, statistic, "exact", slack, ridge, 0)
         return _learner(
-            f"RIFOM ({form})", method, perception, _half_sure(psi, reportable), configuration,
-            first_logits, forgetting, iterations, tolerance, "newton", False,
-        )  # fmt: skip
+            f"RIFOM ({form})",
+            method,
+            perception,
+            _half_sure(psi, reportable),
+            configuration,
+            first_logits,
+            forgetting,
+            iterations,
+            tolerance,
+            "newton",
+            False,
+        )
 
     return on_scaled_features(mdp, build)
 
 
 def robust_irl(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Batch:
-    """Robust IRL (Eqs. 6.3 and 6.4): the sensor is known, and all trajectories are there at once.
+    """Build robust IRL (Eqs. 6.3 and 6.4): a known sensor, and all trajectories at once.
 
-    Batch latent maximum-entropy IRL under that sensor; options and errors as of
+    Batch latent maximum-entropy IRL under that sensor; options and errors as for
     :func:`~i2rl.inference.batch_lme`. Raises ``ValueError`` for a sensor without an observation model.
     """
     sensor = fitting_sensor(sensor, mdp)
@@ -339,14 +372,14 @@ def _checked_predicates(
 
 
 def _half_sure(psi: np.ndarray, reportable: ArrayLike | None) -> FeatureNoise:
-    """The sensor without what is to be learned: what can be reported at all does not depend on it."""
+    """Build the sensor with reliabilities of one half: the reportable pairs do not depend on them."""
     return FeatureNoise(
         psi, np.full(len(psi), 0.5), None if reportable is None else np.asarray(reportable, bool)
     )
 
 
 def initial_logits(psi: np.ndarray, start: ArrayLike) -> Float[Array, " J"]:
-    """Logits that are right this often where every value of a predicate is equally common."""
+    """Return logits with agreement ``start`` if every value of a predicate is equally common."""
     p = np.asarray(start, float)
     if p.shape not in ((), (len(psi),)):
         raise ValueError(
@@ -374,7 +407,7 @@ class _Point(NamedTuple):
 
 
 class _Expected(NamedTuple):
-    """What both programs are fitted to, and what the M-step needs besides."""
+    """Targets of both programs, and further arguments of the M-step."""
 
     reports: Any
     working: Any
@@ -403,7 +436,7 @@ class _Alternation(NamedTuple):
     def complete(
         self, session: PreparedSession, confidence: Array, plan: Any, logits: Array
     ) -> tuple[Any, Any]:
-        """The demonstration and its reports under a plan and reliabilities."""
+        """Complete the demonstration and its observations under a plan and reliabilities."""
         evidence = report_log_evidence(
             self.perception.classes, logits, session.reports, confidence, self.method.sensor.visibility
         )
@@ -414,7 +447,7 @@ class _Alternation(NamedTuple):
     def expect(
         self, state: RIMEOState, session: PreparedSession, confidence: Array, point: _Point
     ) -> _Expected:
-        """The E-step."""
+        """Run the E-step."""
         mdp, statistic = self.method.mdp, self.method.statistic
         plan = self.method.plan(point.weights, point.values)
         completed, reports = self.complete(session, confidence, plan, point.logits)
@@ -429,22 +462,27 @@ class _Alternation(NamedTuple):
         return _Expected(heard, working, plan.values, gradient, own)
 
     def advance(self, point: _Point, expected: _Expected, logits: Array, solution: Any) -> _Point:
-        """The point after both M-steps."""
+        """Return the point after both M-steps."""
         agreement = self.perception.agreement(logits, expected.reports)
-        # Before the first report there is no agreement that could move.
+        # Before the first observation no agreement can move.
         moved = jnp.max(jnp.where(jnp.isnan(agreement), 0.0, jnp.abs(agreement - point.agreement)))
         weights = jnp.asarray(solution.weights)
         return _Point(
-            weights, jnp.asarray(solution.values), logits, agreement,
-            jnp.maximum(relative_change(point.weights, weights), moved), expected.gradient,
+            weights,
+            jnp.asarray(solution.values),
+            logits,
+            agreement,
+            jnp.maximum(relative_change(point.weights, weights), moved),
+            expected.gradient,
             point.iterations + 1,
-            point.solver_iterations + solution.iterations, jnp.asarray(solution.converged),
-        )  # fmt: skip
+            point.solver_iterations + solution.iterations,
+            jnp.asarray(solution.converged),
+        )
 
     def close(
         self, state: RIMEOState, session: PreparedSession, confidence: Array, point: _Point, program: Any
     ) -> tuple[RIMEOState, RIMEOInfo]:
-        """End a session: complete it once more, under its own result, and keep the statistics."""
+        """End a session: complete it once more, under its own result, and update the statistics."""
         mdp, statistic = self.method.mdp, self.method.statistic
         plan = self.method.plan(point.weights, point.values)
         completed, reports = self.complete(session, confidence, plan, point.logits)
@@ -468,7 +506,7 @@ class _Alternation(NamedTuple):
         learned = RIMEOState(
             point.weights, kept, plan.values, point.logits, heard, program, number, state.key
         )
-        # A report that cannot be must not spoil what was learned (a fleet raises nothing).
+        # Keep the previous state if the observation has probability zero; compiled fleets cannot raise.
         possible = jnp.isfinite(own)
         spared = state._replace(program=program)
         return jax.tree.map(partial(jnp.where, possible), learned, spared), RIMEOInfo(**report)
@@ -490,7 +528,7 @@ def _learner(
     if iterations < 1:
         raise ValueError(f"a session needs at least one iteration, got {iterations}")
     if not 0 < forgetting <= 1:
-        raise ValueError(f"forgetting is an exponent in (0, 1], got {forgetting}")
+        raise ValueError(f"forgetting must be an exponent in (0, 1], got {forgetting}")
     mdp = method.mdp
     parts = _Alternation(method, perception, forgetting)
 
@@ -519,9 +557,15 @@ def _learner(
     def init(key: Array) -> RIMEOState:
         key, fresh = jax.random.split(as_key(key))
         return RIMEOState(
-            random_weights(fresh, mdp), method.statistic.empty(mdp), jnp.zeros(mdp.n_states), first_logits,
-            perception.empty, warm, jnp.zeros((), int), key,
-        )  # fmt: skip
+            random_weights(fresh, mdp),
+            method.statistic.empty(mdp),
+            jnp.zeros(mdp.n_states),
+            first_logits,
+            perception.empty,
+            warm,
+            jnp.zeros((), int),
+            key,
+        )
 
     def update(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOInfo]:
         began = time.perf_counter()
@@ -563,7 +607,7 @@ def _learner(
 def _outside(
     parts: _Alternation, iterations: int, tolerance: float
 ) -> tuple[Callable[[RIMEOState, Any], tuple[RIMEOState, RIMEOInfo]], Any]:
-    """A session whose two programs are solved by IPOPT, and its first warm starts."""
+    """Build a session whose two programs are solved by IPOPT, and its first warm starts."""
     method, perception = parts.method, parts.perception
     solve, empty = host_solver(method.mdp, "ipopt", method.statistic.name)
     opening, expect = jax.jit(parts.prepare), jax.jit(parts.expect)
@@ -576,7 +620,7 @@ def _outside(
         point = parts.first(state)
         while point.iterations < iterations and point.change > tolerance:
             expected = expect(state, prepared, confidence, point)
-            if not np.isfinite(expected.own):  # no program to solve: update says which step cannot be
+            if not np.isfinite(expected.own):  # no program to solve: update names the impossible step
                 break
             slack, ridge = method.penalties(expected.working, state.session + 1)
             solution, rewards = solve(expected.working, slack, ridge, rewards)
@@ -603,7 +647,7 @@ class _Solved(NamedTuple):
 def _checked_session(
     mdp: TabularMDP, name: str, demonstration: Any, scores_needed: bool, truth_needed: bool
 ) -> Demonstration:
-    """What was seen, with the scores that are needed."""
+    """Check a session's demonstration and its scores."""
     if truth_needed != isinstance(demonstration, WithTruth):
         given = type(demonstration).__name__
         raise TypeError(
@@ -622,7 +666,7 @@ def _checked_session(
 
 
 def _require_truth(mdp: TabularMDP, demonstration: WithTruth) -> None:
-    """Raise :class:`DemonstrationError` unless what happened is known wherever something was reported."""
+    """Raise :class:`DemonstrationError` unless the truth of every observed step is known."""
     seen, truth = demonstration
     if np.shape(truth.kind) != np.shape(seen.kind):
         raise DemonstrationError(

@@ -1,4 +1,4 @@
-"""What a multi-task learner concludes: several rewards, and which trajectory was done which way."""
+"""Result of a multi-task learner: several rewards, and the assignment of trajectories to them."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from ...models.inputs.display import shown_briefly
 
 @shown_briefly
 class Clustering(NamedTuple):
-    """Ways of doing a task, found in a jumble of trajectories.
+    """Components of a mixture, found in the trajectories of one demonstration.
 
     Fields
     ------
     weights : float ``[D, K]``
-        Reward weights of each way.
+        Reward weights of each component.
     proportions : float ``[D]``
         Mixture weights ``pi_d``; they sum to one.
     responsibilities : float ``[n, D]``
-        ``v_{d,i}``: probability that trajectory ``i`` was done in component ``d``; rows sum to one.
+        ``v_{d,i}``: probability that trajectory ``i`` belongs to component ``d``; rows sum to one.
     objective : float
-        What the method maximised, in nats.
+        Maximised objective of the method, in nats.
     """
 
     weights: Float[np.ndarray, "D K"]
@@ -33,10 +33,10 @@ class Clustering(NamedTuple):
 
     @property
     def n_components(self) -> int:
-        """Number of ways found, ``D``."""
+        """Number of components, ``D``."""
         return len(self.weights)
 
     @property
     def assignments(self) -> Int[np.ndarray, " n"]:
-        """The likeliest way of each trajectory."""
+        """The likeliest component of each trajectory."""
         return np.asarray(self.responsibilities).argmax(axis=1)

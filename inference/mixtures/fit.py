@@ -1,24 +1,23 @@
 """The min-max-entropy mixture fitted by alternation: assignments, proportions and rewards in turn.
 
-The sound form of program (5.1). Given trajectories and, online, what is kept of earlier ones, it climbs ::
+The sound form of program (5.1). Given trajectories and, online, the statistic of earlier ones, it climbs ::
 
     J = sum_{i,d} v_{d,i} log P(X_i; theta_d) + sum_d N_d . log pi_theta_d
-        - price { sum_{i,d} v_{d,i} log v_{d,i} - sum_d (n_d + sum_i v_{d,i}) log pi_d
-                  - strength sum_d pi_d log pi_d }
-        - sum_d (l1 |theta_d|_1 + ridge/2 |theta_d|^2)
+        - temperature { sum_{i,d} v_{d,i} log v_{d,i} - sum_d (n_d + sum_i v_{d,i}) log pi_d
+                        - strength sum_d pi_d log pi_d }
+        - sum_d (slack |theta_d|_1 + ridge/2 |theta_d|^2)
 
-(``n_d``, ``N_d``: mass and visits kept of earlier sessions). The E-step makes ``v_{d,i}`` proportional to
+(``n_d``, ``N_d``: mass and visits of earlier sessions). The E-step makes ``v_{d,i}`` proportional to
 ``pi_d P(X_i; theta_d)^(1/temperature)``; the M-steps are
-:func:`~i2rl.inference.programs.entropic.entropic_proportions` and one maximum-entropy program per way
-(:func:`~i2rl.inference.programs.maximum_entropy.fit_counts`). ``J`` never falls while the ways stay the same.
-Features are scaled (:mod:`~i2rl.models.process.units`), so penalties are of scaled weights.
+:func:`~i2rl.inference.programs.entropic.entropic_proportions` and one maximum-entropy program per component
+(:func:`~i2rl.inference.programs.maximum_entropy.fit_counts`). ``J`` never falls while the set of components
+is fixed. Features are scaled (:mod:`~i2rl.models.process.units`), so penalties are of scaled weights.
 
-*How many ways.* With ``temperature`` 1, ``J`` is the likelihood of a mixture, and that cannot tell a sorter
-who flips a coin once and then sticks to it from two sorters who know what they want: the first costs ``log
-2`` nats of indecision, the second ``log 2`` nats to say which sorter it was. Mixtures of rewards are about
-people who know what they want, so the information of who did what is charged at less than its price (a point
-further along the same rate-distortion curve). :mod:`~i2rl.inference.mixtures.merging` decides how many ways
-there are.
+*Number of components.* With ``temperature`` 1, ``J`` is the likelihood of a mixture. It cannot distinguish
+one stochastic expert, who draws a choice once and repeats it, from two deterministic experts: the first costs
+``log 2`` nats for the choice, the second ``log 2`` nats for the assignment. A lower temperature weighs the
+assignment less (a point further along the same rate-distortion curve) and prefers several deterministic
+experts. :mod:`~i2rl.inference.mixtures.merging` chooses the number of components.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from ..programs.maximum_entropy import WarmStart, fit_scaled_counts
 
 @shown_briefly
 class MixtureProgram(NamedTuple):
-    """What is being solved: see the module's formula; features of ``mdp`` are scaled.
+    """Settings of the program in the module's formula; features of ``mdp`` are scaled.
 
     The climb ends when ``J`` gains less than ``tolerance`` nats, or after ``iterations``.
     """
@@ -58,7 +57,7 @@ class MixtureProgram(NamedTuple):
 
 @shown_briefly
 class Kept(NamedTuple):
-    """What is kept of earlier trajectories: how many were done each way, and the visits they made."""
+    """Statistic of earlier trajectories: mass and visits of each component."""
 
     mass: Float[Array, " D"]
     visits: Float[Array, "D S A"]
@@ -66,7 +65,7 @@ class Kept(NamedTuple):
 
 @shown_briefly
 class Mixture(NamedTuple):
-    """Ways of doing the task; a way without proportion is an empty slot."""
+    """Components of a mixture; a component without proportion is an empty slot."""
 
     weights: Float[Array, "D K"]
     values: Float[Array, "D S"]
@@ -75,26 +74,26 @@ class Mixture(NamedTuple):
 
 @shown_briefly
 class Fit(NamedTuple):
-    """A mixture, what it makes of the jumble, and what finding it took.
+    """A mixture, its assignment of the trajectories, and the work of finding it.
 
     Fields
     ------
     mixture : Mixture
     kept : Kept
-        What was kept, merged as the ways were.
+        Statistic of earlier trajectories, merged as the components were.
     responsibilities : float ``[n, D]``
         ``v_{d,i}``; zero for rows of padding.
     visits, seen : float ``[D, S, A]``
-        The jumble's expected visits by way: of all steps, and of the steps seen.
+        Expected visits of the trajectories by component: of all steps, and of the seen steps.
     log_likelihood : float ``[n]``
         ``log sum_d pi_d P(X_i; theta_d)``.
     objective, score : float
-        ``J``, and what solutions of different sizes are ranked by (minus infinity until it is asked for).
+        ``J``, and the score that ranks solutions of different sizes (minus infinity until it is computed).
     gain : float
-        Of ``J`` in the last iteration.
+        Gain of ``J`` in the last iteration.
     iterations, solver_iterations : int
     converged : bool
-        Whether the programs of the last M-step met their tolerances.
+        True if the programs of the last M-step met their tolerances.
     """
 
     mixture: Mixture
@@ -112,12 +111,12 @@ class Fit(NamedTuple):
 
 
 def nothing_kept(mdp: TabularMDP, n_components: int) -> Kept:
-    """The statistic before the first trajectory."""
+    """Return the statistic before the first trajectory."""
     return Kept(jnp.zeros(n_components), jnp.zeros((n_components, mdp.n_states, mdp.n_actions)))
 
 
 def empty_mixture(mdp: TabularMDP, n_components: int) -> Mixture:
-    """So many empty slots."""
+    """Return a mixture of ``n_components`` empty slots."""
     return Mixture(
         jnp.zeros((n_components, mdp.n_features)),
         jnp.zeros((n_components, mdp.n_states)),
@@ -131,7 +130,7 @@ def empty_mixture(mdp: TabularMDP, n_components: int) -> Mixture:
 def log_policies(
     mdp: TabularMDP, weights: Float[Array, "D K"], values: Float[Array, "D S"]
 ) -> tuple[Float[Array, "D S A"], Float[Array, "D S"]]:
-    """Soft log-policies of every way (``-inf`` where an action is unavailable), and their values."""
+    """Return soft log-policies of every component (``-inf`` for unavailable actions), and their values."""
 
     def one(inputs: tuple) -> tuple:
         plan = soft_plan(mdp, reward_of(mdp, inputs[0]), inputs[1])
@@ -141,13 +140,13 @@ def log_policies(
 
 
 def _finite_log(p: Array) -> Array:
-    """``log p``, and 0 where ``p`` is 0: for sums in which such terms carry no mass."""
+    """Return ``log p``, and 0 where ``p`` is 0: for sums in which such terms carry no mass."""
     return jnp.where(p > 0, jnp.log(jnp.where(p > 0, p, 1.0)), 0.0)
 
 
 @shown_briefly
 class Assigned(NamedTuple):
-    """Who did what: responsibilities, what each trajectory adds to ``J``, its log-likelihood."""
+    """Assignments: responsibilities, each trajectory's share of ``J``, and its log-likelihood."""
 
     responsibilities: Float[Array, "n D"]
     value: Float[Array, " n"]
@@ -160,7 +159,7 @@ def assign(
     live: Bool[Array, " n"],
     temperature: Array | float,
 ) -> Assigned:
-    """The E-step, given the log-likelihood of every trajectory under every way."""
+    """Run the E-step, given the log-likelihood of every trajectory under every component."""
     present = jnp.where(proportions > 0, _finite_log(proportions), -jnp.inf)
     joint = log_likelihood.T / temperature + present
     total = jax.nn.logsumexp(joint, axis=1)
@@ -174,19 +173,19 @@ def assign(
 
 
 def proportions_of(program: MixtureProgram, mass: Float[Array, " D"]) -> Float[Array, " D"]:
-    """The best proportions after so many trajectories of each way; of none, all slots stay empty."""
+    """Return the best proportions for each component's mass; without mass all slots stay empty."""
     return jnp.where(jnp.sum(mass) > 0, entropic_proportions(mass, program.strength), 0.0)
 
 
 def penalty(program: MixtureProgram, weights: Float[Array, "*D K"]) -> Float[Array, ""]:
-    """What the priors on the weights take off ``J``, in nats."""
+    """Return the penalty of the priors on the weights in ``J``, in nats."""
     return program.slack * jnp.sum(jnp.abs(weights)) + program.ridge / 2 * jnp.sum(weights**2)
 
 
 def objective_of(
     program: MixtureProgram, kept: Kept, mixture: Mixture, policies: Float[Array, "D S A"], assigned: Assigned
 ) -> Float[Array, ""]:
-    """``J``."""
+    """Evaluate ``J``."""
     weights, proportions = mixture.weights, mixture.proportions
     known = jnp.sum(kept.visits * jnp.where(program.mdp.available, policies, 0.0))
     entropic = program.strength * jnp.sum(xlogy(proportions, proportions))
@@ -211,7 +210,7 @@ def e_step(
     iterations: Array,
     solver_iterations: Array,
 ) -> Fit:
-    """Who did what under these ways, and ``J``; ``before`` is the ``J`` to compare with."""
+    """Assign trajectories under these components, and evaluate ``J`` and its gain over ``before``."""
     policies, values = log_policies(program.mdp, mixture.weights, mixture.values)
     mixture = mixture._replace(values=values)
     explained = explain_each(program.mdp, policies, trajectories, mixture.proportions > 0)
@@ -219,18 +218,27 @@ def e_step(
     objective = objective_of(program, kept, mixture, policies, assigned)
     shares = assigned.responsibilities
     return Fit(
-        mixture, kept, shares, _collected(shares, explained.visits), _collected(shares, explained.seen),
-        assigned.log_likelihood, objective, jnp.array(-jnp.inf), objective - before, iterations,
-        solver_iterations, jnp.array(True),
-    )  # fmt: skip
+        mixture,
+        kept,
+        shares,
+        _collected(shares, explained.visits),
+        _collected(shares, explained.seen),
+        assigned.log_likelihood,
+        objective,
+        jnp.array(-jnp.inf),
+        objective - before,
+        iterations,
+        solver_iterations,
+        jnp.array(True),
+    )
 
 
 def _m_step(
     program: MixtureProgram, kept: Kept, mixture: Mixture, mass: Float[Array, " D"], visits: Array
 ) -> tuple[Mixture, Int[Array, ""], Bool[Array, ""]]:
-    """Proportions and rewards for the trajectories assigned to each way, kept ones included.
+    """Fit proportions and rewards to the trajectories assigned to each component, earlier ones included.
 
-    With them the iterations of the solver, and whether every program met its tolerance.
+    Also returns the iterations of the solver, and a flag that every program met its tolerance.
     """
 
     def reward(inputs: tuple) -> tuple:
@@ -251,7 +259,7 @@ def climb(
     responsibilities: Float[Array, "n D"],
     visits: Float[Array, "D S A"],
 ) -> Fit:
-    """Alternate until ``J`` stands still, beginning with the M-step for these assignments."""
+    """Alternate until ``J`` converges, beginning with the M-step for these assignments."""
 
     def step(fit: Fit) -> Fit:
         mass = jnp.sum(fit.responsibilities, axis=0)
@@ -275,10 +283,20 @@ def unmade(
     responsibilities: Array,
     visits: Array,
 ) -> Fit:
-    """A fit that is still to be made: assignments alone."""
+    """Return a fit with assignments alone, to be climbed from."""
     nowhere, zero = jnp.array(-jnp.inf), jnp.zeros((), int)
     unknown = jnp.zeros(trajectories.live.shape)
     return Fit(
-        mixture, kept, responsibilities, visits, visits, unknown, nowhere, nowhere, -nowhere, zero, zero,
+        mixture,
+        kept,
+        responsibilities,
+        visits,
+        visits,
+        unknown,
+        nowhere,
+        nowhere,
+        -nowhere,
+        zero,
+        zero,
         jnp.array(True),
-    )  # fmt: skip
+    )

@@ -1,9 +1,9 @@
-"""How many ways of doing a task: merging ways, and where to start looking for them.
+"""The number of components: merging components, and the starts of their search.
 
-The climb of :mod:`~i2rl.inference.mixtures.fit` starts from more ways than needed, and two are merged as long
-as the score gains by it: ``J`` less Laplace's estimate of what each reward costs, ``log det(1 + F_d / ridge)
-/ 2`` (``F_d``: information about ``theta_d`` in the visits of component ``d``). Without that, experts who
-are not decided are split by their chance choices.
+The climb of :mod:`~i2rl.inference.mixtures.fit` starts from more components than needed, and two are merged
+as long as the score gains by it: ``J`` less Laplace's estimate of each reward's cost,
+``log det(1 + F_d / ridge) / 2`` (``F_d``: information about ``theta_d`` in the visits of component ``d``).
+Without that cost, stochastic experts are split by their chance choices.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ from .fit import (
     unmade,
 )
 
-# Without a prior on the rewards none of them would be worth its price.
+# Without a prior on the rewards the estimate would reject every reward.
 _LEAST_PRECISION = 1e-3
 # Nats that starts are climbed to before the best of them is chosen.
 _LOOSE = 1e-2
@@ -54,7 +54,7 @@ _LOOSE = 1e-2
 def _complexity(
     program: MixtureProgram, mixture: Mixture, visits: Float[Array, "D S A"]
 ) -> Float[Array, " D"]:
-    """What each reward costs besides its penalty, by Laplace's approximation of its evidence, in nats."""
+    """Return each reward's cost besides its penalty, by Laplace's approximation of its evidence, in nats."""
 
     def one(inputs: tuple) -> Float[Array, ""]:
         weights, values, proportion, counts = inputs
@@ -73,7 +73,7 @@ def _occam(
 
 
 def _merged(fit: Fit, a: Int[Array, ""], b: Int[Array, ""]) -> tuple[Kept, Array, Array]:
-    """What is kept, the assignments and the visits when way ``b`` becomes part of component ``a``."""
+    """Merge component ``b`` into component ``a``: return statistic, assignments and visits."""
 
     def pour(x: Array) -> Array:
         return x.at[a].add(x[b]).at[b].set(0.0)
@@ -83,14 +83,14 @@ def _merged(fit: Fit, a: Int[Array, ""], b: Int[Array, ""]) -> tuple[Kept, Array
 
 
 def _best_possible(visits: Float[Array, "S A"]) -> Float[Array, ""]:
-    """Log-likelihood of visits under the policy that fits them best, whatever its reward."""
+    """Return the log-likelihood of visits under the policy that fits them best, whatever its reward."""
     return jnp.sum(xlogy(visits, visits)) - jnp.sum(xlogy(visits.sum(1), visits.sum(1)))
 
 
 def merge_once(program: MixtureProgram, trajectories: Trajectories, fit: Fit) -> tuple[Array, Fit, Array]:
-    """The best of all mergers of two ways, refitted (one reward) but not climbed from; whether to take it.
+    """Return the best merger of two components, refitted (one reward) but not climbed from, and its verdict.
 
-    Ways whose greedy policies agree in every reachable state are one, whatever the score says.
+    Components whose greedy policies agree in every reachable state are merged, whatever the score.
     """
     mdp, n_components = program.mdp, fit.mixture.proportions.shape[0]
     pairs = jnp.array([(a, b) for a in range(n_components) for b in range(a + 1, n_components)], int).reshape(
@@ -138,7 +138,7 @@ def merge_once(program: MixtureProgram, trajectories: Trajectories, fit: Fit) ->
         same = jnp.all((greedy[a] == greedy[b]) | ~program.reachable)
         worth = alive
         if isinstance(trajectories, SeenWhole):
-            # No policy at all could explain both well enough: then no reward's policy does.
+            # If the best of all policies fits both badly, every reward's policy does.
             mass = fit.kept.mass + jnp.sum(fit.responsibilities, axis=0)
             pair_mass = mass[a] + mass[b]
             saved = xlogy(pair_mass, pair_mass) - xlogy(mass[a], mass[a]) - xlogy(mass[b], mass[b])
@@ -154,12 +154,12 @@ def merge_once(program: MixtureProgram, trajectories: Trajectories, fit: Fit) ->
     merged = fit._replace(
         mixture=best.mixture, kept=best.kept, responsibilities=best.responsibilities, visits=best.visits
     )
-    # Where a trajectory cannot be explained at all, nothing is worth more than anything else.
+    # If a trajectory is impossible under all components, all scores are equal.
     return jnp.isfinite(score) & (best.score >= score - program.tolerance), merged, score
 
 
 def settle(program: MixtureProgram, trajectories: Trajectories, start: Fit) -> Fit:
-    """Climb; merge two ways and climb again, as long as that gains."""
+    """Climb; merge two components and climb again, as long as that gains."""
 
     def step(carry: tuple) -> tuple:
         before, _ = carry
@@ -180,7 +180,7 @@ def settle(program: MixtureProgram, trajectories: Trajectories, start: Fit) -> F
     return lax.while_loop(lambda carry: carry[1], step, (start, jnp.array(True)))[0]
 
 
-# -- where to start -----------------------------------------------------------------------------------
+# -- starts ---------------------------------------------------------------------------------------------
 
 
 def seed_components(
@@ -190,10 +190,10 @@ def seed_components(
     centres: Float[Array, "D K"],
     mass: Float[Array, " D"],
 ) -> Float[Array, "n D"]:
-    """Assign trajectories by their features to known ways and to new ones: k-means++, seeded at random.
+    """Assign trajectories by their features to known components and to new ones: k-means++, seeded at random.
 
-    ``centres`` and ``mass`` describe the ways known so far; slots without mass are filled with trajectories
-    drawn in proportion to their squared distance from what is there (Arthur and Vassilvitskii 2007).
+    ``centres`` and ``mass`` describe the known components; slots without mass are filled with trajectories
+    drawn in proportion to their squared distance from the known centres (Arthur and Vassilvitskii 2007).
     """
     n_components = mass.shape[0]
 
@@ -221,7 +221,7 @@ def seed_components(
         total = mass[:, None] * centres + shares.T @ points
         return jnp.where(size[:, None] > 0, total / jnp.maximum(size, 1e-300)[:, None], means)
 
-    # Known ways come first, wherever their slots are: new ones are to be far from all of them.
+    # Known components come first, whatever their slots: new ones are to be far from all of them.
     slots = (jax.random.split(key, n_components), jnp.arange(n_components))
     (filled, _), _ = lax.scan(fill, (centres, mass > 0), slots)
     return assigned(lax.fori_loop(0, 10, settle, filled))
@@ -230,7 +230,7 @@ def seed_components(
 def _seeded(
     program: MixtureProgram, trajectories: Trajectories, guess: Explained, kept: Kept, key: Array
 ) -> tuple[Float[Array, "n D"], Float[Array, "D S A"]]:
-    """Assignments by features per step, as far as these are known before any reward is."""
+    """Assign by features per step, as far as these are known before any reward is."""
 
     def per_step(visits: Float[Array, "... S A"]) -> Float[Array, "... K"]:
         steps = jnp.maximum(jnp.sum(visits, axis=(-2, -1)), 1e-300)
@@ -242,7 +242,7 @@ def _seeded(
 
 @shown_briefly
 class Search(NamedTuple):
-    """The best fit, and how many starts were tried."""
+    """Best fit of a search, and the number of its starts."""
 
     fit: Fit
     tried: Int[Array, ""]
@@ -256,10 +256,10 @@ def search(
     key: Array,
     restarts: Array | int,
 ) -> Search:
-    """Find ways of doing the task: from those known and, if some may be hidden, from ``restarts`` seedings.
+    """Find components: from those known and, if some may be hidden, from ``restarts`` seedings.
 
-    The first start opens no way but those of ``mixture``. Only if these explain trajectories badly, or there
-    are none yet, are the empty slots filled, ``restarts`` times over; the best fit is returned.
+    The first start uses only the components of ``mixture``. If these explain trajectories badly, or there
+    are none yet, the empty slots are filled, ``restarts`` times over; the best fit is returned.
     """
     known = jnp.any(kept.mass > 0)
     guess = without_reward(program.mdp, trajectories)
@@ -276,12 +276,12 @@ def search(
             lambda: _seeded(program, trajectories, guess, kept, jax.random.fold_in(key, number)),
         )
         fresh = unmade(program, trajectories, kept, mixture, shares, visits)
-        # The last round of several continues the best of the others, until it stands still.
+        # The last of several iterations continues the best of the others until convergence.
         start = jax.tree.map(lambda x, y: jnp.where(last & suspicious, x, y), best, fresh)
         tolerance = jnp.where(last, program.tolerance, jnp.maximum(program.tolerance, _LOOSE))
         fit = settle(program._replace(tolerance=tolerance), trajectories, start)
         best = jax.tree.map(lambda x, y: jnp.where(last | (fit.score > best.score), x, y), fit, best)
-        # Without an empty slot there is nothing to seed.
+        # Without an empty slot there is no component to seed.
         more = suspicious & ((number > 0) | ~known | jnp.any(fit.mixture.proportions == 0))
         tried = number + ~(last & suspicious)
         return tried, best, ~(more & (tried < restarts + known)), last
@@ -297,12 +297,13 @@ def search(
 def may_hide_a_component(
     program: MixtureProgram, trajectories: Trajectories, expected: Fit
 ) -> Bool[Array, ""]:
-    """Whether known ways, not yet adapted, explain trajectories so badly that a new way could pay.
+    """Return whether known components explain trajectories so badly that a new one could pay.
 
-    At best a new way predicts every action of the trajectories that it takes over; what is kept is explained
-    as well as it can be already. If the new way would not even then buy the information of who did what, for
-    any number of the worst explained trajectories, nothing is taken to be hidden. (Actions that were not
-    seen count as the known ways guess them: a way that differs only where nobody looks is not suspected.)
+    At best a new component predicts every action of the trajectories that it takes over; the earlier
+    statistic is already explained as well as possible. If even then the new component would not pay for the
+    information of its assignments, for any number of the worst explained trajectories, the result is False.
+    (Hidden actions count as the known components predict them: a component that differs only in hidden states
+    is not found.)
     """
     policies, _ = log_policies(program.mdp, expected.mixture.weights, expected.mixture.values)
     explained = explain_each(program.mdp, policies, trajectories, expected.mixture.proportions > 0)

@@ -1,6 +1,6 @@
-"""Chains of NUTS: where they start, how one runs, how several run at once.
+"""Chains of NUTS: their starts, the run of one, and the parallel run of several.
 
-For densities over unconstrained sites. What sites mean, and what to report of them, is the caller's.
+They are for densities over unconstrained sites, whose meaning and output the caller defines.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple, TypeVar
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
@@ -20,8 +21,8 @@ from scipy import optimize
 
 from ...models.inputs.display import shown_briefly
 
-# The metric NUTS starts from may stretch its longest axis this much over its shortest, no more: the
-# curvature at the mode says nothing about how far a prior with a kink or a saturated likelihood reaches.
+# Largest ratio of the axes of NUTS's initial metric: the curvature at the mode does not show how far a prior
+# with a kink or a saturated likelihood reaches.
 _MAX_STRETCH = 10.0
 
 Drawn = TypeVar("Drawn")
@@ -29,7 +30,7 @@ Drawn = TypeVar("Drawn")
 
 @shown_briefly
 class Transitions(NamedTuple):
-    """What NUTS did for each draw of a chain.
+    """Statistics of NUTS for each draw of a chain.
 
     Fields
     ------
@@ -50,7 +51,13 @@ class Transitions(NamedTuple):
 
 
 def run_nuts(
-    key: Array, kernel: NUTS, start: Any, constrain: Callable[[Any], Drawn], warmup: int, draws: int
+    key: Array,
+    kernel: NUTS,
+    start: Any,
+    constrain: Callable[[Any], Drawn],
+    warmup: int,
+    draws: Any,
+    room: int | None = None,
 ) -> tuple[Drawn, Transitions]:
     """Run one chain of NUTS; traceable, so that chains and replications can be mapped over.
 
@@ -58,21 +65,25 @@ def run_nuts(
     ----------
     key : JAX random key
     kernel : numpyro.infer.NUTS
-        Made with a ``potential_fn``; a kernel for each call, since it remembers the one it was set up for.
+        Made with a ``potential_fn``; each call needs its own kernel, since a kernel stores its set-up.
     start : array, or pytree of arrays
         Unconstrained sites.
     constrain : function
-        From unconstrained sites to what is kept of a draw, an array or a pytree of arrays; it is kept of
-        draws in ``warmup`` too, until the chain ends.
+        Function from unconstrained sites to the stored form of a draw, an array or a pytree of arrays; draws
+        of ``warmup`` are stored too, until the chain ends.
     warmup, draws : int
-        Draws discarded, in which the kernel adapts, and draws kept.
+        Draws discarded, in which the kernel adapts, and draws returned.
+    room : int, optional
+        Makes ``draws`` a number that JAX may trace, at most ``room``: one compiled chain then serves every
+        number of draws up to it.
 
     Returns
     -------
-    drawn : as ``constrain`` returns, with a leading axis ``[draws]``
+    drawn : as ``constrain`` returns, with a leading axis ``[draws]``, or ``[room]``, filled up to ``draws``
     transitions : Transitions
     """
 
+    @jax.jit  # traced once, though the shapes of what it returns are asked for
     def advance(state: HMCState, _: None) -> tuple[HMCState, tuple[Drawn, Transitions]]:
         state = kernel.sample(state, (), {})
         return state, (
@@ -88,13 +99,31 @@ def run_nuts(
         )
 
     state = kernel.init(key, warmup, start, (), {})
+    if room is not None:
+        shapes = jax.eval_shape(advance, state, None)[1]
+        empty = jax.tree.map(lambda x: jnp.zeros((room, *x.shape), x.dtype), shapes)
+
+        def keep(i: Int[Array, ""], carry: tuple) -> tuple:
+            state, kept = carry
+            state, new = advance(state, None)
+            # The first place is written in the warm-up too, and keeps the first draw after it.
+            place = jnp.maximum(i - warmup, 0)
+            return state, jax.tree.map(lambda xs, x: xs.at[place].set(x), kept, new)
+
+        return lax.fori_loop(0, warmup + draws, keep, (state, empty))[1]
     # One scan, its beginning dropped: two would each trace and compile the whole sampler.
     chain = lax.scan(advance, state, None, warmup + draws)[1]
     return jax.tree.map(lambda x: x[warmup:], chain)
 
 
+def room_for(number: int, least: int = 8) -> int:
+    """Round a size up to one of few, by a quarter at most: programs are then compiled for few shapes."""
+    step = max(2 ** (max(number - 1, 1).bit_length() - 3), 1)
+    return max(-(-number // step) * step, least)
+
+
 def in_threads(run: Callable[..., Drawn], arguments: Sequence[tuple]) -> Drawn:
-    """Call ``run`` with each of ``arguments``, in as many threads as there are processors; results stacked.
+    """Call ``run`` with each of ``arguments``, in as many threads as there are processors; stack the results.
 
     Threads rather than ``vmap``: mapped chains would wait for the longest tree, and solves do not batch.
     """
@@ -105,7 +134,7 @@ def in_threads(run: Callable[..., Drawn], arguments: Sequence[tuple]) -> Drawn:
 
 @shown_briefly
 class Mode(NamedTuple):
-    """Where NUTS starts: the mode of the unconstrained density and a covariance from its curvature."""
+    """Start of NUTS: the mode of the unconstrained density and a covariance from its curvature."""
 
     position: Float[np.ndarray, " D"]
     covariance: Float[np.ndarray, "D D"]
@@ -117,7 +146,7 @@ def mode_of(
     """Climb from ``origin`` to a mode (L-BFGS) and measure its curvature by differences of gradients.
 
     ``value_and_gradient`` is of the negative log-density. The covariance is the inverse curvature, except
-    that no axis is longer than ten times the shortest: flatter or bent the other way, it is cut to that.
+    that no axis is longer than ten times the shortest: flatter or negative curvature is clipped to that.
     """
 
     def objective(x: np.ndarray) -> tuple[float, np.ndarray]:

@@ -1,10 +1,10 @@
-"""Gibbs sampling of which way each trajectory was done (Neal 2000, algorithm 8).
+"""Gibbs sampling of the assignments of trajectories to components (Neal 2000, algorithm 8).
 
 The posterior of :func:`mixture_model` without truncation: proportions are integrated out, leaving the
-Chinese restaurant process over partitions. A trajectory chooses between the ways of all others and
-``auxiliary`` new ones from the prior; then each way's weights move by elliptical slice sampling (Murray,
-Adams and MacKay 2010), which needs neither gradients nor tuning; then a random concentration moves. There are
-as many slots for ways as trajectories, so a sweep can never run out of them.
+Chinese restaurant process over partitions. A trajectory chooses between the components of all others and
+``auxiliary`` new ones from the prior; then each component's weights move by elliptical slice sampling
+(Murray, Adams and MacKay 2010), which needs neither gradients nor tuning; then a random concentration moves.
+There is one slot per trajectory, so the slots always suffice.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ _CONCENTRATION_MOVES = 5
 
 @shown_briefly
 class Reference(NamedTuple):
-    """The Gaussian that elliptical slices are cut by: mean and Cholesky factor over unconstrained weights."""
+    """Gaussian of the elliptical slices: mean and Cholesky factor over unconstrained weights."""
 
     mean: Float[Array, " D"]
     scale_tril: Float[Array, "D D"]
@@ -56,9 +56,9 @@ class Seating(NamedTuple):
     assignment : int ``[n]``
         Slot of each trajectory.
     position : float ``[n, D]``
-        Unconstrained weights of each slot; those of empty slots mean nothing.
+        Unconstrained weights of each slot; those of empty slots are arbitrary.
     log_likelihood : float ``[n, u]``
-        Of each distinct trajectory under each slot's weights.
+        Log-likelihood of each distinct trajectory under each slot's weights.
     concentration : float
     """
 
@@ -79,7 +79,7 @@ class Seated(NamedTuple):
 
 
 def reference_gaussian(prior: dist.Distribution) -> Reference:
-    """The prior itself where it is normal, else a Gaussian of its middle and spread (any is exact)."""
+    """Return a Gaussian prior itself, else a Gaussian of its centre and spread (any one is exact)."""
     bare = prior.base if isinstance(prior, ScaledPrior) else prior
     while isinstance(bare, dist.Independent | dist.ExpandedDistribution):
         bare = bare.base_dist
@@ -106,7 +106,7 @@ def gibbs_chain(
     moves: int = 4,
     thin: int = 1,
 ) -> Seated:
-    """Run one chain; traceable. ``draws`` are kept, every ``thin``-th sweep after at least ``warmup``."""
+    """Run one chain; traceable. Return ``draws``, every ``thin``-th iteration after at least ``warmup``."""
     step = partial(sweep, problem=problem, reference=reference, auxiliary=auxiliary, moves=moves)
     constrain = dist.biject_to(problem.prior.support)
 
@@ -133,7 +133,7 @@ def sweep(
     auxiliary: int,
     moves: int,
 ) -> tuple[Seating, Int[Array, ""]]:
-    """Every trajectory, every way's weights, and the concentration once; and slice evaluations made."""
+    """Update every trajectory, every component's weights, and the concentration once; count evaluations."""
     seat_key, move_key, concentration_key = jax.random.split(key, 3)
     state = _reseat(seat_key, state, problem, auxiliary)
     state, evaluations = _move_weights(move_key, state, problem, reference, moves)
@@ -150,7 +150,7 @@ def _reseat(key: Array, state: Seating, problem: MixtureProblem, auxiliary: int)
     mdp, perceived, rows = problem.mdp, problem.perceived, problem.rows
     n = len(rows)
     draw_key, choose_key = jax.random.split(key)
-    # New ways come from the prior whatever the seating, so all of a sweep's are planned for at once.
+    # New components come from the prior whatever the seating, so an iteration plans all of them at once.
     drawn = problem.prior.sample(draw_key, (n, auxiliary))
     policies = soft_policies(mdp, drawn.reshape(n * auxiliary, -1))
     policies = policies.reshape((n, auxiliary, *mdp.available.shape))
@@ -164,7 +164,7 @@ def _reseat(key: Array, state: Seating, problem: MixtureProblem, auxiliary: int)
         counts = jnp.bincount(assignment, length=n).at[own].add(-1)
         alone = counts[own] == 0
         offered = jax.vmap(lambda policy: _row_log_likelihood(problem, policy, row))(policies)
-        # Who sits alone keeps the way as the first of the new ones.
+        # A trajectory alone in its component has it as the first of the new ones.
         offered = offered.at[0].set(jnp.where(alone, table[own, row], offered[0]))
         known = jnp.where(counts > 0, jnp.log(jnp.maximum(counts, 1)) + table[:, row], -jnp.inf)
         choice = jax.random.categorical(key, jnp.concatenate([known, spread + offered]))
@@ -192,7 +192,7 @@ def _reseat(key: Array, state: Seating, problem: MixtureProblem, auxiliary: int)
 def _row_log_likelihood(
     problem: MixtureProblem, log_policy: Float[Array, "S A"], row: Int[Array, ""]
 ) -> Float[Array, ""]:
-    """Log-likelihood of one trajectory: a forward pass only if it is hidden in places."""
+    """Return the log-likelihood of one trajectory; run a forward pass only if it has hidden steps."""
     perceived = problem.perceived
     counts, dynamics, log_evidence, live, _ = perceived
 
@@ -230,7 +230,7 @@ def _move_weights(
         return column, height(x, column, members)
 
     def height(x: Float[Array, " D"], column: Float[Array, " u"], members: Float[Array, " u"]) -> Array:
-        """Log-density relative to the Gaussian."""
+        """Return the log-density relative to the Gaussian."""
         weights = constrain(x)
         log_prior = prior.log_prob(weights) + constrain.log_abs_det_jacobian(x, weights).sum()
         return jnp.sum(jnp.where(members > 0, members * column, 0.0)) + log_prior - gaussian.log_prob(x)
@@ -246,7 +246,7 @@ def _move_weights(
         def propose(carry: tuple) -> tuple:
             key, angle, low, high, _, count = carry
             y = reference.mean + (x - reference.mean) * jnp.cos(angle) + away * jnp.sin(angle)
-            # Where to look next, should this be refused: on the side of the bracket that holds angle zero.
+            # The next proposal after a refusal: on the side of the bracket that holds angle zero.
             low, high = jnp.where(angle < 0, angle, low), jnp.where(angle < 0, high, angle)
             key, draw = jax.random.split(key)
             onward = jax.random.uniform(draw, minval=low, maxval=high)
@@ -278,7 +278,7 @@ def move_concentration(
     n_components: Int[Array, ""],
     n: int,
 ) -> Float[Array, ""]:
-    """Metropolis steps of random size on the concentration given the number of ways."""
+    """Make Metropolis steps of random size on the concentration given the number of components."""
     transform = dist.biject_to(prior.support)
 
     def density(z: Float[Array, ""]) -> Float[Array, ""]:
@@ -300,7 +300,7 @@ def move_concentration(
 def seating_of(
     problem: MixtureProblem, assignment: Int[Array, " n"], position: Float[Array, "c D"], concentration: Array
 ) -> Seating:
-    """The sampler's state at ways ``[c]`` of given unconstrained weights; traceable."""
+    """Return the sampler's state for components ``[c]`` of given unconstrained weights; traceable."""
     n = len(assignment)
     position = jnp.zeros((n, position.shape[1])).at[: len(position)].set(position)
     policies = soft_policies(problem.mdp, dist.biject_to(problem.prior.support)(position))
@@ -313,8 +313,9 @@ def break_remainder(
 ) -> tuple[Float[Array, "T K"], Float[Array, " T"], Int[Array, " n"]]:
     """Draw the process given one seating: weights and proportions of ``components``, and the assignment.
 
-    Ways that occur come first and share ``Dirichlet(n_1, ..., n_k, alpha)`` with all others, whose share is
-    broken into sticks, the last taking what is left. There must be fewer ways than components.
+    Occupied components come first and share ``Dirichlet(n_1, ..., n_k, alpha)`` with all others, whose share
+    is broken into sticks, the last taking the rest. There must be fewer occupied components than
+    ``components``.
     """
     share_key, rest_key, stick_key, weight_key = jax.random.split(key, 4)
     n, alpha = len(seated.assignment), seated.concentration
@@ -323,8 +324,9 @@ def break_remainder(
     order = jnp.argsort(counts == 0, stable=True)
     rank = jnp.argsort(order)
     occupied = counts[order][:components] > 0
-    # Everything by inversion (gamma variates are slow to compile): the others' share is Beta(alpha, n), a
-    # product of Beta(alpha + i, 1); a way's is a sum of as many exponential variates as it has trajectories.
+    # All draws by inversion (gamma variates are slow to compile): the others' share is Beta(alpha, n), a
+    # product of Beta(alpha + i, 1); a component's is a sum of as many exponential variates as it has
+    # trajectories.
     rest = jnp.exp(jnp.sum(jnp.log(jax.random.uniform(rest_key, (n,))) / (alpha + jnp.arange(n))))
     shares = jnp.zeros(size).at[seated.assignment].add(jax.random.exponential(share_key, (n,)))
     shares = shares[order][:components]
@@ -360,29 +362,29 @@ def gibbs_mixture_posterior(
 ) -> az.InferenceData:
     """Draw from the posterior of the Dirichlet process that :func:`mixture_model` truncates.
 
-    Trajectories change ways one at a time, so the sampler moves between partitions that NUTS cannot leave,
-    if slowly where a way has many trajectories. The two posteriors differ by truncation alone (see
-    :func:`truncation_error`). R-hat under label switching: see :func:`sample_mixture_posterior`.
+    Trajectories change components one at a time, so the sampler moves between partitions that NUTS cannot
+    leave, though slowly if a component has many trajectories. The two posteriors differ by truncation alone
+    (see :func:`truncation_error`). R-hat under label switching: see :func:`sample_mixture_posterior`.
 
     Parameters
     ----------
     key, mdp, sensor, demonstration, concentration, prior, draws, chains
         As in :func:`sample_mixture_posterior`.
     components : int
-        Components written out of the process: those with trajectories, then others by stick-breaking. More
-        are written if a draw has that many ways: none is lost.
+        Components in the output: the occupied ones, then others by stick-breaking. There are more if a draw
+        has more occupied components, so that none is lost.
     warmup, thin : int
-        Sweeps discarded by each chain, and sweeps for each draw kept.
+        Iterations discarded by each chain, and iterations per returned draw.
     auxiliary : int
-        New ways offered to a trajectory, Neal's ``m``.
+        New components offered to a trajectory, Neal's ``m``.
     moves : int
-        Slice moves of each way's weights in a sweep.
+        Slice moves of each component's weights in an iteration.
 
     Returns
     -------
     arviz.InferenceData
         Laid out as by :func:`sample_mixture_posterior`; ``sample_stats`` has ``lp``, the log-joint of
-        partition and weights, and ``n_steps``, the evaluations that slices took.
+        partition and weights, and ``n_steps``, the number of slice evaluations.
 
     Raises
     ------
@@ -397,11 +399,15 @@ def gibbs_mixture_posterior(
         concentration=concentration,
         prior=prior,
         at_least_one={
-            "components": components, "draws": draws, "chains": chains,
-            "auxiliary": auxiliary, "moves": moves, "thin": thin,
+            "components": components,
+            "draws": draws,
+            "chains": chains,
+            "auxiliary": auxiliary,
+            "moves": moves,
+            "thin": thin,
         },
         warmup=warmup,
-    )  # fmt: skip
+    )
     start_key, chain_key, break_key, resolve_key = jax.random.split(key, 4)
     reference = reference_gaussian(problem.prior)
     run = partial(_run_chain, warmup=warmup, draws=draws, auxiliary=auxiliary, moves=moves, thin=thin)
@@ -432,7 +438,7 @@ _seating = jax.jit(seating_of)
 def _seat(problem: MixtureProblem, start: Start) -> Seating:
     alpha = problem.concentration
     alpha = jnp.ones(()) if isinstance(alpha, dist.Distribution) else alpha
-    # Chains start with different numbers of ways; one shape for all compiles once.
+    # Chains start with different numbers of components; one shape for all compiles once.
     position = np.zeros((len(start.assignment), start.position.shape[1]))
     position[: len(start.position)] = start.position
     return _seating(problem, jnp.asarray(start.assignment), jnp.asarray(position), alpha)

@@ -1,4 +1,4 @@
-"""The posterior over several ways of doing a task, as ArviZ ``InferenceData``.
+"""The posterior over a mixture of reward functions, as ArviZ ``InferenceData``.
 
 NUTS moves in weights and proportions, with assignments and hidden steps summed out exactly; then each draw
 gets one joint assignment of the trajectories. :mod:`~i2rl.inference.posteriors.gibbs` draws from the same
@@ -42,8 +42,8 @@ from .mixture_problem import (
 class MixtureChain(NamedTuple):
     """One chain of NUTS.
 
-    ``weights [draws, T, K]``, ``proportions [draws, T]``, ``concentration [draws]``, and what the sampler
-    did.
+    ``weights [draws, T, K]``, ``proportions [draws, T]``, ``concentration [draws]``, and the sampler's
+    statistics.
     """
 
     weights: Float[Array, "draws T K"]
@@ -74,7 +74,7 @@ def nuts_mixture_chain(
 
 
 def constrained(position: Position, problem: MixtureProblem) -> tuple[Array, Array, Array]:
-    """Weights, proportions and concentration at unconstrained sites."""
+    """Return weights, proportions and concentration at unconstrained sites."""
     weights = dist.biject_to(problem.prior.support)(position["weights"])
     proportions = jnp.ones(1)
     if "sticks" in position:
@@ -91,7 +91,7 @@ _run_chain = jax.jit(
 
 
 def _start_position(key: Array, start: Start, problem: MixtureProblem, components: int) -> Position:
-    """Unconstrained sites at a start; components without trajectories are drawn from the prior."""
+    """Return unconstrained sites at a start; components without trajectories are drawn from the prior."""
     alpha = problem.concentration
     position: Position = {}
     if isinstance(alpha, dist.Distribution):
@@ -125,29 +125,29 @@ def sample_mixture_posterior(
 ) -> az.InferenceData:
     """Draw from the posterior of :func:`mixture_model` by NUTS, then assignments given each draw.
 
-    NUTS follows gradients and does not hop between modes: a mode is a partition of the trajectories into
-    ways, times every naming of the components. Each chain starts from another partition (k-means of feature
-    counts into two to six ways, each way at its own posterior mode), and what it explores from there is what
-    it reports. So R-hat of ``weights`` and ``proportions`` is large whenever chains name the components
-    differently, which is no fault, and small only if they happen not to. Diagnose the quantities of
-    :func:`label_invariant` instead: if *their* R-hat is large, chains are in different partitions, their
-    draws must not be pooled, and :func:`gibbs_mixture_posterior`, which moves trajectories one by one, is
+    NUTS follows gradients and seldom moves between modes: a mode is a partition of the trajectories into
+    components, times every naming of them. Each chain starts from another partition (k-means of feature
+    counts into two to six components, each at its own posterior mode) and explores only its surroundings.
+    R-hat of ``weights`` and ``proportions`` is therefore large whenever chains name the components
+    differently, which is no fault, and small only by chance. Diagnose the quantities of
+    :func:`label_invariant` instead. If *their* R-hat is large, chains are in different partitions and their
+    draws must not be pooled; :func:`gibbs_mixture_posterior`, which moves trajectories one by one, is then
     the better sampler.
 
     Parameters
     ----------
     key : JAX random key
     mdp, sensor, demonstration
-        The decision process, how it was perceived, and what was perceived. Scores play no part.
+        The decision process, its sensor, and the observations. Scores are ignored.
     components : int
-        ``T``, the truncation; the attribute ``truncation_error`` says what it may cost.
+        ``T``, the truncation; the attribute ``truncation_error`` bounds its effect.
     concentration : float or Distribution
         ``alpha``, or its prior.
     prior : Distribution, optional
-        Of each way's scaled weights (:mod:`~i2rl.models.process.units`), see
+        Prior of each component's scaled weights (:mod:`~i2rl.models.process.units`), see
         :func:`~i2rl.models.weights_prior`.
     draws, warmup, chains : int
-        Draws kept and discarded by each chain, and number of chains.
+        Draws returned and discarded by each chain, and number of chains.
     target_accept, max_tree_depth
         As in NumPyro's ``NUTS``.
 
@@ -157,10 +157,10 @@ def sample_mixture_posterior(
         ``posterior``: ``weights (chain, draw, component, feature)``, ``proportions (chain, draw,
         component)``, and ``concentration (chain, draw)`` if it is random.
         ``assignments``: ``assignment (chain, draw, trajectory)``, the component of each trajectory in that
-        draw; ``n_components (chain, draw)``, the number of components that have any, and its posterior
+        draw; ``n_components (chain, draw)``, the number of occupied components, and its posterior
         ``n_ways_probability (components)``, 1 to the number of trajectories; ``log_joint (chain, draw)``, see
         :class:`Resolved`; ``co_clustering (trajectory, trajectory_)``, the posterior probability that two
-        trajectories were done the same way.
+        trajectories belong to one component.
         ``log_likelihood``: ``demonstration (chain, draw, trajectory)``, assignments summed out.
         ``sample_stats``: as in :func:`sample_posterior`.
         ``observed_data``: ``kind``, ``state``, ``action (trajectory, step)``.
@@ -168,7 +168,7 @@ def sample_mixture_posterior(
     Raises
     ------
     DemonstrationError
-        Naming trajectory and step, if the MDP and the sensor rule an observation out.
+        Naming trajectory and step, if an observation is impossible under the MDP and the sensor.
     ValueError
         For an empty demonstration, a prior of another shape, a concentration that is not positive, numbers of
         components, draws or chains below one, or an undiscounted MDP.

@@ -1,4 +1,4 @@
-"""The problem that samplers of a mixture's posterior share: its arguments, where to start, what to report."""
+"""The common problem of samplers of a mixture's posterior: its arguments, starts, and output."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ from ...version import __version__
 from .chains import in_threads as in_threads
 from .weights import described_prior, fingerprint
 
-# Chains start with at most this many ways: each costs a climb, and superfluous ones are given up in warmup.
+# Chains start with at most this many components: each costs a climb, and warmup empties superfluous ones.
 _MOST_STARTING_WAYS = 6
 
 
 @shown_briefly
 class MixtureProblem(NamedTuple):
-    """Arguments of :func:`mixture_model`, trajectories prepared; ``rows`` finds each among them.
+    """Arguments of :func:`mixture_model` with prepared trajectories; ``rows`` is each one's index among them.
 
     ``prior`` is over one component's weights ``[K]``; ``concentration`` is a number or its prior.
     """
@@ -64,17 +64,17 @@ class MixtureProblem(NamedTuple):
 
 @shown_briefly
 class Resolved(NamedTuple):
-    """What belongs to each draw of weights and proportions.
+    """Assignment and densities of each draw of weights and proportions.
 
     Fields
     ------
     assignment : int ``[draws, n]``
-        Which component each trajectory was done in.
+        Component of each trajectory.
     log_likelihood : float ``[draws, n]``
-        Of each trajectory, assignments and hidden steps summed out.
+        Log-likelihood of each trajectory, assignments and hidden steps summed out.
     log_joint : float ``[draws]``
-        Log-density of the partition into ways, of the weights of those that occur, of the concentration if
-        it is random, and of what was perceived: whatever the components are called.
+        Log-density of the partition into components, of the weights of occupied ones, of the concentration if
+        it is random, and of the observations; it does not depend on the components' names.
     """
 
     assignment: Int[Array, "draws n"]
@@ -86,7 +86,7 @@ Position = dict[str, Array]
 
 
 def potential(position: Position, problem: MixtureProblem) -> Float[Array, ""]:
-    """Negative log-density of the declared model at unconstrained sites."""
+    """Return the negative log-density of the declared model at unconstrained sites."""
     mdp, sensor, perceived, _, prior, concentration = problem
     options = {"components": len(position["weights"]), "concentration": concentration, "prior": prior}
     return potential_energy(mixture_model, (mdp, sensor, perceived), options, position)
@@ -96,7 +96,7 @@ _potential_and_gradient = jax.jit(jax.value_and_grad(potential))
 
 
 def log_partition(counts: Int[Array, " T"], concentration: Float[Array, ""]) -> Float[Array, ""]:
-    r"""Chinese restaurant process: :math:`\alpha^k \prod_d (n_d - 1)! \, \Gamma(\alpha)/\Gamma(\alpha+n)`."""
+    r"""Return the log of :math:`\alpha^k \prod_d (n_d - 1)! \, \Gamma(\alpha)/\Gamma(\alpha+n)`."""
     occupied = counts > 0
     tables = jnp.where(occupied, gammaln(jnp.where(occupied, counts, 1).astype(float)), 0.0)
     spread = jnp.sum(occupied) * jnp.log(concentration) + jnp.sum(tables)
@@ -111,7 +111,7 @@ def resolve(
     problem: MixtureProblem,
     assignment: Int[Array, "draws n"] | None = None,
 ) -> Resolved:
-    """Assign every trajectory in each draw (or take the assignment given) and evaluate it; traceable."""
+    """Assign every trajectory in each draw (or use the assignment given) and evaluate it; traceable."""
     rows = problem.rows
 
     def one(inputs: tuple) -> Resolved:
@@ -136,7 +136,7 @@ resolve_jit = jax.jit(resolve)
 
 @shown_briefly
 class Start(NamedTuple):
-    """Where a chain starts: the way of each trajectory (the first has most), and unconstrained weights."""
+    """Start of a chain: each trajectory's component (the first is largest), and unconstrained weights."""
 
     assignment: Int[np.ndarray, " n"]
     position: Float[np.ndarray, "c D"]
@@ -144,7 +144,7 @@ class Start(NamedTuple):
 
 @jax.jit
 def _mean_features(problem: MixtureProblem) -> Float[Array, "n K"]:
-    """Features of each trajectory, hidden steps averaged under an expert who acts at random."""
+    """Return features of each trajectory, hidden steps averaged under the uniform policy."""
     mdp, (counts, _, log_evidence, live, _) = problem.mdp, problem.perceived
     if len(live):
         indifferent = jnp.where(
@@ -159,7 +159,7 @@ def _mean_features(problem: MixtureProblem) -> Float[Array, "n K"]:
 def _k_means(
     rng: np.random.Generator, points: Float[np.ndarray, "n K"], components: int
 ) -> Int[np.ndarray, " n"]:
-    """Lloyd's algorithm from centres spread at random (k-means++); clusters may stay empty."""
+    """Run Lloyd's algorithm from random centres (k-means++); components may stay empty."""
     centres = points[rng.integers(len(points), size=1)]
     while len(centres) < components:
         distance = ((points[:, None] - centres) ** 2).sum(-1).min(1) + 1e-12
@@ -173,12 +173,12 @@ def _k_means(
 
 
 def starts(key: Array, problem: MixtureProblem, chains: int, most: int) -> list[Start]:
-    """A start for each chain: k-means of feature counts, into different numbers of ways, and their modes."""
+    """Build a start per chain: k-means of feature counts, into several components, and their modes."""
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     points = np.asarray(_mean_features(problem))
     points = points / np.maximum(points.std(0), 1e-12)
     most = min(most, _MOST_STARTING_WAYS, len(points))
-    # One way's density knows neither the concentration nor how many trajectories there are.
+    # One component's density involves neither the concentration nor the number of trajectories.
     one_component = problem._replace(concentration=jnp.ones(()), rows=problem.rows[:0])
     rows, size = np.asarray(problem.rows), len(problem.perceived.repeats)
 
@@ -216,7 +216,7 @@ def pose(
     at_least_one: dict[str, int],
     warmup: int,
 ) -> tuple[MixtureProblem, Demonstration, Int[np.ndarray, " n"]]:
-    """Check and prepare what was given; also its rows that are not all padding, and their indices.
+    """Check and prepare the arguments; also return the rows with steps, and their indices.
 
     Errors as in :func:`~i2rl.inference.posteriors.mixture.sample_mixture_posterior`.
     """
@@ -246,7 +246,7 @@ def mixture_data(
     stats: dict[str, np.ndarray],
     method: str,
 ) -> az.InferenceData:
-    """Draws ``(weights, proportions, concentration)`` of whichever sampler, in the one layout."""
+    """Arrange draws ``(weights, proportions, concentration)`` of either sampler in one layout."""
     weights, proportions, concentration = drawn
     chains, draws, components, _ = weights.shape
     n = demonstration.n_trajectories
@@ -261,7 +261,7 @@ def mixture_data(
         "sensor": type(problem.sensor).__name__,
         "sensor_fingerprint": fingerprint(problem.sensor),
         "prior": described_prior(problem.prior),
-        # The worst over draws where the concentration is random.
+        # The worst over draws if the concentration is random.
         "truncation_error": truncation_error(n, components, float(np.max(concentration))),
     }
     if isinstance(problem.concentration, dist.Distribution):
@@ -277,12 +277,16 @@ def mixture_data(
         observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},
         coords={"feature": list(problem.mdp.feature_names), "trajectory": present},
         dims={
-            "weights": ["component", "feature"], "proportions": ["component"],
-            "demonstration": ["trajectory"], "kind": steps, "state": steps, "action": steps,
+            "weights": ["component", "feature"],
+            "proportions": ["component"],
+            "demonstration": ["trajectory"],
+            "kind": steps,
+            "state": steps,
+            "action": steps,
         },
         attrs=attrs,
         posterior_attrs=attrs,
-    )  # fmt: skip
+    )
     assignment = np.asarray(resolved.assignment)
     shared = np.zeros((n, n))
     occupied = np.zeros(len(assignment), int)
@@ -310,13 +314,13 @@ def mixture_data(
 
 
 def label_invariant(idata: az.InferenceData) -> xr.Dataset:
-    """Quantities of a mixture's posterior that do not depend on what the components are called.
+    """Return quantities of a mixture's posterior that do not depend on the components' names.
 
     For ``az.rhat``, ``az.ess``, ``az.summary`` and ``az.plot_trace``: ``n_components``, ``log_joint`` and
     ``log_likelihood (chain, draw)``, ``proportion (chain, draw, rank)`` from the largest down,
-    ``trajectory_weights (chain, draw, trajectory, feature)``, the weights that each trajectory was done with,
-    and ``concentration`` if it is random. (R-hat of a quantity that never varies, such as ``n_components``
-    where it is certain, is NaN.)
+    ``trajectory_weights (chain, draw, trajectory, feature)``, the weights of each trajectory's component, and
+    ``concentration`` if it is random. (R-hat of a constant quantity, such as ``n_components`` if it is
+    certain, is NaN.)
     """
     posterior, group = idata["posterior"], idata["assignments"]
     descending = -np.sort(-posterior.proportions.values, axis=-1)

@@ -1,6 +1,6 @@
-"""The posterior over reward weights and the reliabilities of perception together, as ArviZ ``InferenceData``.
+"""The joint posterior over reward weights and reliabilities of perception, as ArviZ ``InferenceData``.
 
-NUTS moves in weights and logits of reliabilities, with the truth behind every report summed out exactly.
+NUTS moves in weights and logits of reliabilities, with the truth behind every observation summed out exactly.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ from ...version import __version__
 from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
 from .weights import described_prior, fingerprint, gather
 
-# Nats: a mode that holds less than e^-this of the best one is no place to start a chain.
+# Nats: chains do not start at modes that hold less than e^-this of the best one.
 _NEGLIGIBLE = float(np.log(100.0))
 
 
@@ -58,7 +58,7 @@ class NoisyProblem(NamedTuple):
 
 @shown_briefly
 class NoisyChain(NamedTuple):
-    """One chain of NUTS: ``weights [draws, K]``, ``reliabilities [draws, J]`` and what the sampler did."""
+    """One chain of NUTS: ``weights [draws, K]``, ``reliabilities [draws, J]`` and its statistics."""
 
     weights: Float[Array, "draws K"]
     reliabilities: Float[Array, "draws J"]
@@ -76,7 +76,7 @@ def _constrained(position: Float[Array, " D"], problem: NoisyProblem) -> dict[st
 
 
 def noisy_potential(position: Float[Array, " D"], problem: NoisyProblem) -> Float[Array, ""]:
-    """Negative log-density of the declared model at unconstrained weights, then reliabilities."""
+    """Return the negative log-density of the model at unconstrained weights, then reliabilities."""
     options = {
         "view": problem.view,
         "reportable": problem.reportable,
@@ -104,8 +104,8 @@ def noisy_chain(
 ) -> NoisyChain:
     """Run one chain of NUTS; traceable, so that chains and replications can be mapped over.
 
-    Starts at an unconstrained position with a dense ``inverse_mass``; both that matrix and the step size are
-    adapted during ``warmup``.
+    It starts at an unconstrained position with a dense ``inverse_mass``; both that matrix and the step size
+    are adapted during ``warmup``.
     """
     kernel = NUTS(
         potential_fn=lambda z: noisy_potential(z, problem),
@@ -123,10 +123,10 @@ _run_chain = jax.jit(noisy_chain, static_argnames=("warmup", "draws", "target_ac
 
 
 def noisy_mode(problem: NoisyProblem, origin: Float[np.ndarray, " D"] | None = None) -> Mode:
-    """A mode of the unconstrained density, climbed to from ``origin``.
+    """Climb from ``origin`` to a mode of the unconstrained density.
 
-    By default that is no weights and reliabilities a little above one half. Only a place to start from: where
-    sloppy experts and sloppy sensors explain the same, there are others.
+    The default origin has zero weights and reliabilities a little above one half. The mode is only a start:
+    if expert noise and sensor noise explain the same data, there are others.
     """
     if origin is None:
         sizes = [
@@ -138,11 +138,11 @@ def noisy_mode(problem: NoisyProblem, origin: Float[np.ndarray, " D"] | None = N
 
 
 def noisy_starts(key: Array, problem: NoisyProblem, chains: int) -> list[Mode]:
-    """Where chains start, with the covariance that each starts from; the same key gives the same.
+    """Return starts of chains, each with its covariance; the same key gives the same starts.
 
     The first climbs from the default origin of :func:`noisy_mode`, the others from draws of the prior, so
-    that modes far apart are found if there are any. One that by its height and curvature holds less than a
-    hundredth of what the best does gives way to that one: no chain could leave it, and draws of all chains
+    that modes far apart are found if there are any. A mode that by its height and curvature holds less than a
+    hundredth of the best is replaced by the best, because a chain could not leave it, and draws of all chains
     count alike. Starts are dispersed around their modes twice as widely as the curvature suggests.
     """
     spread_key, *keys = jax.random.split(key, chains)
@@ -177,7 +177,7 @@ def _drawn_from_prior(key: Array, problem: NoisyProblem) -> Float[np.ndarray, " 
 def noisy_log_likelihood(
     weights: Float[Array, "D K"], reliabilities: Float[Array, "D J"], problem: NoisyProblem
 ) -> Float[Array, "D u"]:
-    """Log-likelihood of each distinct trajectory under every draw."""
+    """Return the log-likelihood of each distinct trajectory under every draw."""
 
     def one(draw: tuple) -> Float[Array, " u"]:
         sensor = FeatureNoise(problem.predicates, draw[1], problem.reportable) * problem.view
@@ -197,7 +197,7 @@ def noisy_problem(
     prior: dist.Distribution | None = None,
     reliability_prior: dist.Distribution | None = None,
 ) -> tuple[NoisyProblem, Int[np.ndarray, " n"]]:
-    """The posterior's problem, checked, and the row that each trajectory became.
+    """Build the posterior's checked problem, and the row of each trajectory in it.
 
     Raises as :func:`sample_noisy_posterior` does.
     """
@@ -210,16 +210,22 @@ def noisy_problem(
         psi, np.full(psi.shape[:1], 0.5), None if reportable is None else np.asarray(reportable)
     )
     seen = Sensor() if view is None else Sensor() * view
-    # What can be reported at all does not depend on how reliably.
+    # The reportable pairs do not depend on the reliabilities.
     require_possible(noise * seen, mdp, demonstration)
     gathered, rows = gather(mdp, seen, demonstration, prior)
     return (
         NoisyProblem(
-            mdp, noise.predicates, noise.reportable, seen, gathered.codes, gathered.repeats, gathered.prior,
+            mdp,
+            noise.predicates,
+            noise.reportable,
+            seen,
+            gathered.codes,
+            gathered.repeats,
+            gathered.prior,
             reliabilities_prior(len(psi), reliability_prior),
         ),
         rows,
-    )  # fmt: skip
+    )
 
 
 def sample_noisy_posterior(
@@ -241,21 +247,21 @@ def sample_noisy_posterior(
 ) -> az.InferenceData:
     """Draw from the joint posterior over weights and reliabilities of :func:`noisy_behaviour_model`.
 
-    Chains start around modes that are climbed to from different origins (:func:`noisy_starts`) and run in as
-    many threads as there are processors. The same key gives the same draws. Chains that stay in modes of
-    their own show in R-hat; their draws then say what modes there are, not how much each of them holds. A
-    prior that does not favour perception better than chance leaves a mirrored mode, see
+    Chains start around modes found from different origins (:func:`noisy_starts`) and run in as many threads
+    as there are processors. The same key gives the same draws. R-hat reveals chains that stay in separate
+    modes; their draws then show the modes, but not their masses. A prior that does not favour perception
+    better than chance leaves a mirrored mode, see
     :func:`~i2rl.models.laws.noisy_behaviour.reliabilities_prior`.
 
     Parameters
     ----------
     key : JAX random key
     mdp, predicates, demonstration, view, reportable, prior, reliability_prior
-        Of the model. Scores play no part.
+        Arguments of the model. Scores are ignored.
     names : tuple of str, optional
-        Of the predicates; ``psi1``, ``psi2``, ... by default.
+        Names of the predicates; ``psi1``, ``psi2``, ... by default.
     draws, warmup, chains : int
-        Draws kept and discarded by each chain, and number of chains.
+        Draws returned and discarded by each chain, and number of chains.
     target_accept, max_tree_depth
         As in NumPyro's ``NUTS``.
 
@@ -270,7 +276,7 @@ def sample_noisy_posterior(
     Raises
     ------
     DemonstrationError
-        Naming trajectory and step, if no truth could give an observation.
+        Naming trajectory and step, if an observation is impossible.
     ValueError
         For an empty demonstration, predicates, priors or names that do not fit, numbers of draws or chains
         below one, or an undiscounted MDP.
@@ -279,9 +285,14 @@ def sample_noisy_posterior(
         if number < least:
             raise ValueError(f"{name} must be at least {least}, got {number}")
     problem, rows = noisy_problem(
-        mdp, predicates, demonstration, view=view, reportable=reportable, prior=prior,
+        mdp,
+        predicates,
+        demonstration,
+        view=view,
+        reportable=reportable,
+        prior=prior,
         reliability_prior=reliability_prior,
-    )  # fmt: skip
+    )
     n_predicates = problem.predicates.shape[0]
     names = tuple(f"psi{j + 1}" for j in range(n_predicates)) if names is None else names
     if len(names) != n_predicates:

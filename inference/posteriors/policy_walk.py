@@ -37,7 +37,7 @@ from ..learners.boltzmann import (
 )
 from .weights import described_prior
 
-# Acceptance the step is tuned to: best for a random walk in several dimensions (Roberts et al. 1997).
+# Target acceptance of the step: best for a random walk in several dimensions (Roberts et al. 1997).
 _TARGET_ACCEPT = 0.3
 
 
@@ -49,11 +49,11 @@ class Walk(NamedTuple):
     ------
     weights : float ``[K]``
     log_likelihood : float ``[n]``
-        Of each trajectory.
+        Log-likelihood of each trajectory.
     lp : float
         Log-density, up to the evidence.
     acceptance_rate : float
-        Probability with which the proposal was accepted.
+        Probability of accepting the proposal.
     accepted : bool
     step_size : float
     """
@@ -82,13 +82,13 @@ def _walk(
         each = count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, rationality), counts)
         if prior is None:
             return each, jnp.sum(each)
-        # Densities are asked for inside their support only: outside, many return a number all the same.
+        # Densities are evaluated inside their support only: outside, many return a number all the same.
         inside = jnp.all(prior.support(weights))
         return each, jnp.where(inside, jnp.sum(each) + prior.log_prob(weights), -jnp.inf)
 
     def move(point: Walk, key: Array) -> Walk:
         noise_key, accept_key = jax.random.split(key)
-        # Reflection keeps the proposal symmetric: there is nothing to correct for.
+        # Reflection preserves the symmetry of the proposal, so it needs no correction.
         weights = reflected(
             point.weights + point.step_size * jax.random.normal(noise_key, mdp.features.shape[2:])
         )
@@ -148,27 +148,27 @@ def birl(
     rationality : float
         Inverse temperature of the expert, per unit of value.
     prior : numpyro.distributions.Distribution, optional
-        Over ``K`` scaled weights, or over one and taken for each; what it puts outside the box is cut off.
+        Over ``K`` scaled weights, or over one and used for each; restricted to the box.
         Uniform on the box by default.
     draws, warmup, chains : int
-        Draws kept and discarded by each chain, and number of chains, which start at draws of the prior.
+        Draws returned and discarded by each chain, and number of chains, which start at draws of the prior.
     step : float
-        Width of the random walk of scaled weights at first; tuned during the warm-up and then fixed.
+        Initial width of the random walk of scaled weights; tuned during the warm-up and then fixed.
 
     Returns
     -------
     arviz.InferenceData
         ``posterior``: ``weights (chain, draw, feature)``.
-        ``log_likelihood``: ``demonstration (chain, draw, trajectory)``, transition probabilities left out.
+        ``log_likelihood``: ``demonstration (chain, draw, trajectory)``, without transition probabilities.
         ``sample_stats``: ``lp``, ``acceptance_rate``, ``accepted``, ``step_size``.
         ``observed_data``: ``kind``, ``state``, ``action (trajectory, step)``.
 
     Raises
     ------
     DemonstrationError
-        Naming trajectory and step, for a step that was not seen or that is impossible.
+        Naming trajectory and step, for a step that was hidden or that is impossible.
     ValueError
-        For numbers that are not positive, a prior of another shape or that rules the whole box out, or an
+        For numbers that are not positive, a prior of another shape or that excludes the whole box, or an
         undiscounted MDP.
     """
     require_discounted(mdp)
@@ -180,10 +180,17 @@ def birl(
     walk: Walk = jax.tree.map(
         np.asarray,
         _walk(
-            as_key(key), with_scaled_features(mdp), jnp.asarray(counts), prior,
-            jnp.asarray(float(rationality)), jnp.asarray(float(step)), chains, warmup, draws,
+            as_key(key),
+            with_scaled_features(mdp),
+            jnp.asarray(counts),
+            prior,
+            jnp.asarray(float(rationality)),
+            jnp.asarray(float(step)),
+            chains,
+            warmup,
+            draws,
         ),
-    )  # fmt: skip
+    )
     if prior is not None and not np.isfinite(walk.lp[:, -1]).all():
         raise ValueError(f"the prior {described_prior(prior)} gives no probability to weights in [-1, 1]")
     attrs = {
@@ -203,9 +210,12 @@ def birl(
         observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},
         coords={"feature": list(mdp.feature_names)},
         dims={
-            "weights": ["feature"], "demonstration": ["trajectory"],
-            "kind": steps, "state": steps, "action": steps,
+            "weights": ["feature"],
+            "demonstration": ["trajectory"],
+            "kind": steps,
+            "state": steps,
+            "action": steps,
         },
         attrs=attrs,
         posterior_attrs=attrs,
-    )  # fmt: skip
+    )

@@ -1,15 +1,16 @@
 """The posterior over reward weights and hidden steps, as ArviZ ``InferenceData``.
 
-NUTS moves in the weights alone, with the hidden steps summed out exactly; then each draw of the weights
-gets one joint completion of the demonstration by backward sampling. Together they are draws from
-``P(theta, hidden steps | what was perceived)``.
+NUTS moves in the weights alone, with the hidden steps summed out exactly; then backward sampling gives each
+draw of the weights one joint completion of the demonstration. Together they are draws from
+``P(theta, hidden steps | observations)``.
 """
 
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Callable
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import arviz as az
 import jax
@@ -38,7 +39,8 @@ from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted, reward_of, soft_plan
 from ...version import __version__
 from ..completion.smoothing import Evidence, evidence_of, log_likelihoods
-from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
+from ..sessions.progress import told
+from .chains import Mode, Transitions, in_threads, mode_of, room_for, run_nuts
 
 
 @shown_briefly
@@ -54,19 +56,19 @@ class Problem(NamedTuple):
 
 @shown_briefly
 class Chain(NamedTuple):
-    """One chain of NUTS: ``weights [draws, K]`` and what the sampler did."""
+    """One chain of NUTS: ``weights [draws, K]`` and the sampler's statistics."""
 
     weights: Float[Array, "draws K"]
     transitions: Transitions
 
     @property
     def diverging(self) -> Bool[Array, " draws"]:
-        """Of the transitions, ``[draws]``."""
+        """Marks of divergent transitions, ``[draws]``."""
         return self.transitions.diverging
 
 
 def potential(position: Float[Array, " D"], problem: Problem) -> Float[Array, ""]:
-    """Negative log-density of the declared model at unconstrained weights."""
+    """Return the negative log-density of the declared model at unconstrained weights."""
     mdp, sensor, codes, repeats, prior = problem
     options = {"prior": prior, "repeats": repeats}
     return potential_energy(occlusion_model, (mdp, sensor, codes), options, {"weights": position})
@@ -85,10 +87,17 @@ def nuts_chain(
 ) -> Chain:
     """Run one chain of NUTS; traceable, so that chains and replications can be mapped over.
 
-    Starts at unconstrained weights ``start`` with a dense ``inverse_mass``; both that matrix and the step
+    It starts at unconstrained weights ``start`` with a dense ``inverse_mass``; both that matrix and the step
     size are adapted during ``warmup``.
     """
-    kernel = NUTS(
+    kernel = _kernel(problem, inverse_mass, target_accept, max_tree_depth)
+    return Chain(*run_nuts(key, kernel, start, dist.biject_to(problem.prior.support), warmup, draws))
+
+
+def _kernel(
+    problem: Problem, inverse_mass: Float[Array, "D D"], target_accept: Any, max_tree_depth: int
+) -> NUTS:
+    return NUTS(
         potential_fn=lambda z: potential(z, problem),
         dense_mass=True,
         inverse_mass_matrix=inverse_mass,
@@ -96,10 +105,30 @@ def nuts_chain(
         target_accept_prob=target_accept,
         max_tree_depth=max_tree_depth,
     )
-    return Chain(*run_nuts(key, kernel, start, dist.biject_to(problem.prior.support), warmup, draws))
 
 
 run_nuts_chain = jax.jit(nuts_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
+
+
+@partial(jax.jit, static_argnames=("warmup", "room", "max_tree_depth"))
+def _run_roomy_chain(
+    key: Array,
+    problem: Problem,
+    start: Float[Array, " D"],
+    inverse_mass: Float[Array, "D D"],
+    draws: Int[Array, ""],
+    target_accept: Float[Array, ""],
+    *,
+    warmup: int,
+    room: int,
+    max_tree_depth: int,
+) -> Chain:
+    """:func:`nuts_chain` with room for ``room`` draws, of which the first ``draws`` are made."""
+    kernel = _kernel(problem, inverse_mass, target_accept, max_tree_depth)
+    constrain = dist.biject_to(problem.prior.support)
+    return Chain(*run_nuts(key, kernel, start, constrain, warmup, draws, room))
+
+
 _potential_and_gradient = jax.jit(jax.value_and_grad(potential))
 
 
@@ -116,7 +145,7 @@ class Completions(NamedTuple):
 
 def _evidence(problem: Problem) -> Evidence:
     kind, state, action = (problem.codes[..., i] for i in range(3))
-    # Scores are not part of the declared model's event, so completions do not hear of them either.
+    # Scores are not part of the declared model's event, so completions ignore them too.
     demonstration = Demonstration(kind, state, action, jnp.full(kind.shape, jnp.nan))  # type: ignore[arg-type]
     return evidence_of(problem.mdp, problem.sensor, demonstration)
 
@@ -146,7 +175,7 @@ def complete(
 
 @jax.jit
 def pointwise_log_likelihood(weights: Float[Array, "D K"], problem: Problem) -> Float[Array, "D u"]:
-    """Log-likelihood of each distinct trajectory under every draw of the weights."""
+    """Return the log-likelihood of each distinct trajectory under every draw of the weights."""
     evidence = _evidence(problem)
 
     def one(theta: Float[Array, " K"]) -> Float[Array, " u"]:
@@ -156,10 +185,43 @@ def pointwise_log_likelihood(weights: Float[Array, "D K"], problem: Problem) -> 
     return lax.map(one, weights)
 
 
-def posterior_mode(problem: Problem) -> Mode:
-    """The mode of the unconstrained density, climbed to from its origin.
+_split = jax.jit(jax.random.split, static_argnums=1)
+# Draws that are looked at in one call: one program then serves every number of draws.
+_BLOCK = 50
+_FEWEST_ROWS = 32
+# A draw of the weights takes next to no memory.
+_FEWEST_DRAWS = 512
 
-    The dissertation's estimate, were the prior flat; here only a place to start from.
+
+def _room_for_draws(draws: int) -> int:
+    return max(_FEWEST_DRAWS, 1 << (draws - 1).bit_length())
+
+
+@jax.jit
+def _complete_block(
+    keys: Array, start: Int[Array, ""], weights: Float[Array, "B K"], problem: Problem, rows: Int[Array, " n"]
+) -> Completions:
+    """:func:`complete` for a block of draws, whose keys begin at ``start``."""
+    return complete(lax.dynamic_slice_in_dim(keys, start, len(weights)), weights, problem, rows)
+
+
+def _in_blocks(function: Callable[[int, np.ndarray], Any], weights: Float[np.ndarray, "D K"]) -> Any:
+    """Call ``function`` with the number of its first draw and ``_BLOCK`` draws, until all had their turn.
+
+    The last block is filled up with copies of the last draw; results ``[D, ...]`` are joined without them.
+    """
+    blocks = []
+    for start in range(0, len(weights), _BLOCK):
+        block = weights[start : start + _BLOCK]
+        filled = np.concatenate([block, np.repeat(block[-1:], _BLOCK - len(block), axis=0)])
+        blocks.append(jax.tree.map(np.asarray, function(start, filled)))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[: len(weights)], *blocks)
+
+
+def posterior_mode(problem: Problem) -> Mode:
+    """Climb from the origin to the mode of the unconstrained density.
+
+    With a flat prior it is the dissertation's estimate; here it is only a start.
     """
 
     size = dist.biject_to(problem.prior.support).inverse_shape(problem.prior.event_shape)
@@ -172,17 +234,17 @@ def gather(
     demonstration: Demonstration,
     prior: dist.Distribution | None = None,
 ) -> tuple[Problem, Int[np.ndarray, " n"]]:
-    """The posterior's problem with identical trajectories gathered, and the row each trajectory became.
+    """Gather identical trajectories into the posterior's problem, and return the row of each.
 
-    Most fragments of a little-seen expert are wholly hidden, hence identical. Rows are padded to a multiple
-    of eight, so that growing demonstrations meet few shapes.
+    Most fragments of a rarely seen expert are wholly hidden, hence identical. Rows are padded to a multiple
+    of eight, so that growing demonstrations have few shapes.
     """
     sensor = fitting_sensor(sensor, mdp)
     codes = np.asarray(checked_demonstration(mdp, demonstration).codes)
     distinct, rows, repeats = np.unique(
         codes.reshape(len(codes), -1), axis=0, return_inverse=True, return_counts=True
     )
-    spare = -len(distinct) % 8
+    spare = -(-room_for(len(distinct)) // 8) * 8 - len(distinct)
     distinct = distinct.reshape(-1, *codes.shape[1:])
     # A row of padding has probability one, whatever the weights.
     distinct = np.concatenate([distinct, np.broadcast_to([PAD, UNKNOWN, UNKNOWN], (spare, *codes.shape[1:]))])
@@ -204,6 +266,7 @@ def sample_posterior(
     completions: bool = True,
     target_accept: float = 0.9,
     max_tree_depth: int = 10,
+    progress: bool = False,
 ) -> az.InferenceData:
     """Draw from the posterior over weights and hidden steps of :func:`occlusion_model`.
 
@@ -214,36 +277,38 @@ def sample_posterior(
     ----------
     key : JAX random key
     mdp, sensor, demonstration
-        The decision process, how it was perceived, and what was perceived. Scores play no part.
+        The decision process, its sensor, and the observations. Scores are ignored.
     prior : numpyro.distributions.Distribution, optional
-        Over ``K`` scaled weights (:mod:`~i2rl.models.process.units`), or over one and taken for each;
-        ``Normal(0, 2.5)`` by default, see :func:`~i2rl.models.weights_prior`. An expert who never errs is
-        fitted ever better by ever larger weights: it is the prior that ends this, and the weights' common
-        length depends on it.
+        Over ``K`` scaled weights (:mod:`~i2rl.models.process.units`), or over one and used for each;
+        ``Normal(0, 2.5)`` by default, see :func:`~i2rl.models.weights_prior`. Larger weights always fit an
+        expert without errors better: the prior alone limits them, and the weights' common length depends on
+        it.
     draws, warmup, chains : int
-        Draws kept and discarded by each chain, and number of chains.
+        Draws returned and discarded by each chain, and number of chains.
     completions : bool
-        Whether to draw the hidden steps too.
+        True to draw the hidden steps too.
     target_accept, max_tree_depth
         As in NumPyro's ``NUTS``.
+    progress : bool
+        Says on standard error what is being done: finding the mode, sampling, completing.
 
     Returns
     -------
     arviz.InferenceData
         ``posterior``: ``weights (chain, draw, feature)``.
         ``completions``: ``state``, ``action (chain, draw, trajectory, step)``, integer indices, -1 beyond a
-        trajectory's end; the draw of the hidden steps that belongs to the posterior's draw of the weights.
-        A group of its own, so that ``az.summary``, ``az.rhat`` and ``az.plot_trace`` are about weights.
-        ``log_likelihood``: ``demonstration (chain, draw, trajectory)``, for ``az.loo`` and ``az.compare``.
-        ``sample_stats``: ``lp``, ``energy``, ``acceptance_rate``, ``step_size``, ``n_steps``,
-        ``tree_depth``, ``reached_max_treedepth``, ``diverging``.
-        ``observed_data``: ``kind``, ``state``, ``action (trajectory, step)``.
-        ``constant_data``: ``state_name``, ``action_name``, which the indices refer to.
+        trajectory's end; each draw of the hidden steps belongs to one posterior draw of the weights. They
+        have their own group, so that ``az.summary``, ``az.rhat`` and ``az.plot_trace`` cover the weights
+        alone. ``log_likelihood``: ``demonstration (chain, draw, trajectory)``, for ``az.loo`` and
+        ``az.compare``. ``sample_stats``: ``lp``, ``energy``, ``acceptance_rate``, ``step_size``, ``n_steps``,
+        ``tree_depth``, ``reached_max_treedepth``, ``diverging``. ``observed_data``: ``kind``, ``state``,
+        ``action (trajectory, step)``. ``constant_data``: ``state_name``, ``action_name``, the names of the
+        indices.
 
     Raises
     ------
     DemonstrationError
-        Naming trajectory and step, if the MDP and the sensor rule an observation out.
+        Naming trajectory and step, if an observation is impossible under the MDP and the sensor.
     ValueError
         For an empty demonstration, a prior of another shape, numbers of draws or chains below one, or an
         undiscounted MDP.
@@ -257,29 +322,60 @@ def sample_posterior(
     require_discounted(mdp)
     problem, rows = gather(mdp, sensor, demonstration, prior)
     require_possible(sensor, mdp, demonstration)
-    mode = posterior_mode(problem)
-    start_key, chain_key, completion_key = jax.random.split(key, 3)
-    spread = 2.0 * np.linalg.cholesky(mode.covariance)
-    starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
-    run = partial(
-        run_nuts_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
-    )
-    keys = jax.random.split(chain_key, chains)
-    chain: Chain = in_threads(
-        run, [(k, problem, x, mode.covariance) for k, x in zip(keys, starts, strict=True)]
-    )
-    flat = jnp.asarray(chain.weights.reshape(chains * draws, -1))
-    shape = (chains, draws, demonstration.n_trajectories)
-    log_likelihood = np.asarray(pointwise_log_likelihood(flat, problem))[:, rows].reshape(shape)
-    completed = None
-    if completions:
-        keys = jax.random.split(completion_key, chains * draws)
-        drawn = complete(keys, flat, problem, jnp.asarray(rows))
-        completed = Completions(*(x.reshape(*shape, -1) for x in drawn))
-    idata = _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
+    with told(progress) as tell:
+        idata = _sampled(
+            key, problem, rows, demonstration, draws, warmup, chains, completions, target_accept,
+            max_tree_depth, tell,
+        )  # fmt: skip
     for attrs in (idata.attrs, idata["posterior"].attrs):
         attrs["key"] = str(np.asarray(jax.random.key_data(key)).tolist())
     return idata
+
+
+def _sampled(
+    key: Array,
+    problem: Problem,
+    rows: Int[np.ndarray, " n"],
+    demonstration: Demonstration,
+    draws: int,
+    warmup: int,
+    chains: int,
+    completions: bool,
+    target_accept: float,
+    max_tree_depth: int,
+    tell: Callable[[str], None],
+) -> az.InferenceData:
+    tell("posterior: finding the mode, compiling first")
+    mode = posterior_mode(problem)
+    tell(f"posterior: {chains} chains of {warmup} + {draws} draws, compiling first")
+    start_key, chain_key, completion_key = jax.random.split(key, 3)
+    spread = 2.0 * np.linalg.cholesky(mode.covariance)
+    starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
+    run = partial(_run_roomy_chain, warmup=warmup, room=_room_for_draws(draws), max_tree_depth=max_tree_depth)
+    keys = jax.random.split(chain_key, chains)
+    chain: Chain = in_threads(
+        run,
+        [
+            (k, problem, x, mode.covariance, draws, float(target_accept))
+            for k, x in zip(keys, starts, strict=True)
+        ],
+    )
+    chain = jax.tree.map(lambda x: x[:, :draws], chain)
+    tell("posterior: log-likelihoods of the draws")
+    flat = np.asarray(chain.weights).reshape(chains * draws, -1)
+    shape = (chains, draws, demonstration.n_trajectories)
+    log_likelihood = _in_blocks(lambda _, w: pointwise_log_likelihood(w, problem), flat)[:, rows]
+    completed = None
+    if completions:
+        tell("posterior: hidden steps")
+        blocks = -(-len(flat) // _BLOCK)
+        keys = _split(completion_key, room_for(blocks, least=1) * _BLOCK)
+        padded = np.zeros(room_for(len(rows), _FEWEST_ROWS), rows.dtype)
+        padded[: len(rows)] = rows
+        drawn = _in_blocks(lambda start, w: _complete_block(keys, start, w, problem, padded), flat)
+        completed = Completions(*(x[:, : len(rows)].reshape(*shape, -1) for x in drawn))
+    log_likelihood = log_likelihood.reshape(shape)
+    return _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
 
 
 def _inference_data(
@@ -319,12 +415,15 @@ def _inference_data(
         observed_data={x: np.asarray(getattr(demonstration, x)) for x in ("kind", "state", "action")},
         coords={"feature": list(mdp.feature_names)},
         dims={
-            "weights": ["feature"], "demonstration": ["trajectory"],
-            "kind": steps, "state": steps, "action": steps,
+            "weights": ["feature"],
+            "demonstration": ["trajectory"],
+            "kind": steps,
+            "state": steps,
+            "action": steps,
         },
         attrs=attrs,
         posterior_attrs=attrs,
-    )  # fmt: skip
+    )
     groups = {}
     if completions is not None:
         grid = {dim: idata.log_likelihood[dim] for dim in ("chain", "draw", "trajectory")}
@@ -354,7 +453,7 @@ def fingerprint(tree: object) -> str:
 
 
 def described_prior(prior: dist.Distribution) -> str:
-    """A distribution with its parameters, through the wrappers that only shape it."""
+    """Describe a distribution with its parameters, through the wrappers that only shape it."""
     if isinstance(prior, ScaledPrior):
         scale, base = np.asarray(prior.scale), described_prior(prior.base)
         return base if (scale == 1).all() else f"{base} on weights times {scale.tolist()}"

@@ -1,4 +1,4 @@
-"""The feature constraints of the maximum-entropy program, and whether any policy can meet them."""
+"""The feature constraints of the maximum-entropy program, and their feasibility."""
 
 from __future__ import annotations
 
@@ -15,23 +15,23 @@ from ...models.process.mdp import PairNames, TabularMDP
 from ...models.process.planning import reachable_states, require_discounted
 from ...models.process.units import feature_scale, with_scaled_features
 
-# Constraints are met where scaled features miss by no more than this share of the largest.
+# Constraints are met if scaled features miss by no more than this share of the largest.
 _MET = 1e-7
-# Discounted visits below this count as none.
+# Discounted visits below this count as zero.
 _LEAST_OCCUPANCY = 1e-4
 
 
 class ProgramNotSolved(RuntimeError):
-    """A solver stopped before it met its tolerances."""
+    """Failure of a solver to meet its tolerances."""
 
 
 class InfeasibleProgram(ValueError):
-    """No policy meets the feature constraints; the message names the features and by how much they miss."""
+    """Constraints that no policy meets; the message names the features and by how much they miss."""
 
 
 @shown_briefly
 class FeatureTarget(NamedTuple):
-    """What the feature program has to match.
+    """Features that the feature program has to match.
 
     Fields
     ------
@@ -46,9 +46,9 @@ class FeatureTarget(NamedTuple):
 
 
 def checked_problem(mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike) -> tuple[np.ndarray, ...]:
-    """Target features ``[K]``, start distribution ``[S]`` and slack ``[K]`` as checked NumPy arrays.
+    """Check target features ``[K]``, start distribution ``[S]`` and slack ``[K]``; return NumPy arrays.
 
-    Raises ``ValueError`` for discount 1, wrong shapes, numbers that are not finite, a start that is no
+    Raises ``ValueError`` for discount 1, wrong shapes, numbers that are not finite, a start that is not a
     distribution, or a negative slack.
     """
     require_discounted(mdp)
@@ -64,7 +64,7 @@ def checked_problem(mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike) ->
 
 
 def checked_slack(mdp: TabularMDP, slack: ArrayLike) -> np.ndarray:
-    """Slack ``[K]`` as a NumPy array; ``ValueError`` unless it is finite and not negative."""
+    """Return slack ``[K]`` as a NumPy array; ``ValueError`` unless it is finite and not negative."""
     checked = np.array(shaped_slack(mdp, slack), float)
     if not (np.isfinite(checked) & (checked >= 0)).all():
         raise ValueError(f"slack must be finite and not negative, got {checked}")
@@ -72,7 +72,7 @@ def checked_slack(mdp: TabularMDP, slack: ArrayLike) -> np.ndarray:
 
 
 def shaped_target(mdp: TabularMDP, target: FeatureTarget) -> tuple[Float[Array, " K"], Float[Array, " S"]]:
-    """Target features ``[K]`` and start ``[S]`` as float arrays; ``ValueError`` for a wrong shape."""
+    """Return target features ``[K]`` and start ``[S]`` as float arrays; ``ValueError`` for a wrong shape."""
     features, start = jnp.asarray(target.features, float), jnp.asarray(target.start, float)
     if features.shape != (mdp.n_features,):
         raise ValueError(
@@ -86,7 +86,7 @@ def shaped_target(mdp: TabularMDP, target: FeatureTarget) -> tuple[Float[Array, 
 
 
 def shaped_slack(mdp: TabularMDP, slack: ArrayLike) -> Float[Array, " K"]:
-    """Slack broadcast to ``[K]``; ``ValueError`` for a wrong shape."""
+    """Broadcast slack to ``[K]``; ``ValueError`` for a wrong shape."""
     slack = jnp.asarray(slack, float)
     if slack.shape not in ((), (mdp.n_features,)):
         raise ValueError(
@@ -126,7 +126,7 @@ class FlowConstraints(NamedTuple):
 
 
 def flow_constraints(mdp: TabularMDP, reachable: np.ndarray) -> FlowConstraints:
-    """The flow constraints over available pairs of the states marked in ``reachable [S]``."""
+    """Build the flow constraints over available pairs of the states marked in ``reachable [S]``."""
     states = np.flatnonzero(reachable)
     position = np.full(mdp.n_states, -1)
     position[states] = np.arange(len(states))
@@ -150,10 +150,10 @@ def flow_constraints(mdp: TabularMDP, reachable: np.ndarray) -> FlowConstraints:
 
 
 def nearest_features(mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike = 0.0) -> np.ndarray:
-    """Expected features ``[K]`` of some policy that violate the constraints least, by linear programming.
+    """Find expected features ``[K]`` of a policy that violates the constraints least, by a linear program.
 
-    Minimises ``sum_k max(|E[phi_k] - phi_hat_k| / scale_k - slack_k, 0)`` over all policies, with the
-    features' scales; the constraints can be met exactly if that sum is zero.
+    It minimises ``sum_k max(|E[phi_k] - phi_hat_k| / scale_k - slack_k, 0)`` over all policies, with the
+    features' scales; the constraints are feasible if that sum is zero.
     """
     from scipy import optimize  # loading it takes a third of a second, and few processes come here
 
@@ -180,10 +180,10 @@ def nearest_features(mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike = 
 def excluded_pairs(
     mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike = 0.0
 ) -> tuple[Int[np.ndarray, " n"], Int[np.ndarray, " n"]]:
-    """States and actions that every policy within the constraints avoids, though it gets to those states.
+    """List states and actions that every policy within the constraints avoids, though it reaches the states.
 
-    Weights are finite exactly where there are none: a soft policy takes every action. By linear programming,
-    for constraints that can be met: ``sum min(x(s, a), least)`` is maximised over occupancies ``x``.
+    Weights are finite exactly if there are none: a soft policy takes every action. For feasible constraints a
+    linear program maximises ``sum min(x(s, a), least)`` over occupancies ``x``.
     """
     from scipy import optimize
 
@@ -218,11 +218,11 @@ def excluded_pairs(
 
 
 def failure(mdp: TabularMDP, target: FeatureTarget, slack: ArrayLike, reason: str) -> Exception:
-    """The error to raise when a solver stopped with ``reason``: what it was that could not be solved.
+    """Build the error for a solver that stopped with ``reason``, naming the cause.
 
-    :class:`InfeasibleProgram` names the features that no policy matches; :class:`ProgramNotSolved` names
-    actions that no policy within the constraints takes, whose avoidance needs infinite weights, if there are
-    any.
+    :class:`InfeasibleProgram` names the features that no policy matches. :class:`ProgramNotSolved` names
+    actions that no policy within the constraints takes, if there are any; avoiding them needs infinite
+    weights.
     """
     wanted, _, relative = checked_problem(mdp, target, slack)
     scale = np.asarray(feature_scale(mdp))

@@ -27,7 +27,7 @@ _QUIET: dict[str, Any] = {
     "ipopt.max_iter": 200,
 }
 COLD_OPTIONS: dict[str, Any] = {**_QUIET, "ipopt.tol": 1e-9}
-# A previous session's solution lies on its bounds: without these, IPOPT would first push it back inside.
+# A previous session's solution lies on its bounds: without these, IPOPT would first push it inside.
 WARM_OPTIONS: dict[str, Any] = {
     **COLD_OPTIONS,
     "ipopt.warm_start_init_point": "yes",
@@ -38,12 +38,12 @@ WARM_OPTIONS: dict[str, Any] = {
     "ipopt.warm_start_slack_bound_frac": 1e-10,
     "ipopt.warm_start_mult_bound_push": 1e-10,
 }
-# Weight of the proximal term, in shares of the discounted visits. The last one moves no weight that the
-# target determines by more than IPOPT's tolerance does, and holds the others where they started; larger ones
-# before it keep IPOPT from steps so long that every policy there is deterministic and says nothing.
+# Weight of the proximal term, in shares of the discounted visits. The last one moves determined weights by
+# less than IPOPT's tolerance, and holds the others where they started. Larger ones before it keep IPOPT from
+# steps so long that every policy is deterministic and has no gradient.
 _PROXIMAL = 1e-10
 _STAGES = (1e-2, 1e-5, _PROXIMAL)
-# Where that term alone holds weights that the target pulls at by more than this share, they have no end.
+# If that term alone holds weights against a pull of more than this share, the weights are infinite.
 _HELD = 1e-7
 
 
@@ -72,11 +72,11 @@ class DualSolution(NamedTuple):
     objective : float
         The minimised objective at these weights, penalties included (nats).
     iterations : int
-        Of IPOPT.
+        IPOPT's iterations.
     converged : bool
-        Whether IPOPT met its tolerance; what is returned to a caller has.
+        True if IPOPT met its tolerance; solutions returned to a caller have.
     warm : IpoptPoint
-        Where to start the next session from.
+        Start for the next session.
     """
 
     weights: Float[np.ndarray, " K"]
@@ -98,12 +98,12 @@ class _Problem(NamedTuple):
 
 
 class _SoftBellmanProgram:
-    """The program that both duals are instances of, built once per MDP::
+    """The common program of both duals, built once per MDP::
 
         minimise    w.V - theta.f + beta.(plus + minus) + ridge/2 |theta|^2 + proximal/2 |theta - centre|^2
         subject to  lower(s) <= log sum_a exp(theta.phi(s, a) + gamma sum P V - V(s)) <= 0
 
-    with ``theta = plus - minus``, features ``phi`` scaled. All but ``phi`` and ``P`` are parameters, and
+    with ``theta = plus - minus`` and scaled features ``phi``. All but ``phi`` and ``P`` are parameters, and
     ``lower`` is 0 or minus infinity.
     """
 
@@ -140,17 +140,17 @@ class _SoftBellmanProgram:
             + proximal / 2 * ca.dot(theta - centre, theta - centre),
             "g": soft_maximum(advantage, state),
         }
-        # Strictly feasible: IPOPT leaves the boundary in directions that lead it far astray.
+        # Strictly feasible: from the boundary IPOPT leaves in directions far from the solution.
         values = soft_values(mdp, jnp.zeros(n_features)) + 1 / (1 - mdp.discount)
         self._origin = np.concatenate([np.zeros(2 * n_features), values])
         self._cold = ca.nlpsol("maxent_cold", "ipopt", program, COLD_OPTIONS)
         self._warm = ca.nlpsol("maxent_warm", "ipopt", program, WARM_OPTIONS)
 
     def _run(self, problem: _Problem, warm: IpoptPoint | None) -> tuple[DualSolution, str]:
-        """Solve from the first start that leads somewhere; status '' means solved.
+        """Solve from the first start that succeeds; status '' means solved.
 
-        A warm start that leads nowhere (the slack changed its pattern, say) is followed by cold ones: in one
-        go, then held by proximal terms that loosen, then from Newton's answer.
+        If a warm start fails (the slack changed its pattern, say), cold starts follow: directly, then held by
+        proximal terms that loosen, then from Newton's solution.
         """
         spent, status = 0, ""
         for start in (self._from_warm, self._at_once, self._in_stages, self._from_newton):
@@ -199,7 +199,7 @@ class _SoftBellmanProgram:
         """Solve from one start, with a proximal term of this share that is centred there."""
         n_states, n_features = self.mdp.n_states, self.mdp.n_features
         state_weights, features, slack, ridge, pinned = problem
-        # Without slack, plus and minus could grow together for nothing: plus alone is then the weight.
+        # Without slack, plus and minus could grow together at no cost: plus alone is then the weight.
         free = slack == 0
         lower = np.concatenate(
             [np.where(free, -np.inf, 0.0), np.zeros(n_features), np.full(n_states, -np.inf)]
@@ -227,7 +227,7 @@ class _SoftBellmanProgram:
         plus, minus, values = np.split(point.variables, [n_features, 2 * n_features])
         weights = plus - minus
         if statistics["success"]:
-            # The barrier keeps V above its equation by mu / occupancy, which is much where nobody goes.
+            # The barrier keeps V above its equation by mu / occupancy, which is large for rare states.
             values = np.asarray(soft_values(self._scaled, jnp.asarray(weights), jnp.asarray(values)))
         objective = (
             state_weights @ values
@@ -252,7 +252,7 @@ class DualProgram(_SoftBellmanProgram):
         minimise    p0.V - theta.phi_hat + sum_k beta_k |theta_k| + ridge/2 |theta|^2
         subject to  log sum_a exp(theta.phi(s, a) + gamma sum P(s' | s, a) V(s')) <= V(s)
 
-    The multipliers of the constraints are the discounted state occupancies. Where nobody comes from ``p0``
+    The multipliers of the constraints are the discounted state occupancies. In states unreachable from ``p0``
     they are zero, and the constraint would leave ``V`` free to drift upwards; there it is an equation.
     Built once per MDP; ``ValueError`` for discount 1.
     """
@@ -272,9 +272,9 @@ class DualProgram(_SoftBellmanProgram):
 
         ``slack`` (a number or ``[K]``) is ``beta``, in units of each feature's scale, and ``ridge`` penalises
         scaled weights (:mod:`~i2rl.models.process.units`). Weights that the target does not determine stay
-        close to where they started. Raises ``InfeasibleProgram`` naming the features that no policy can
-        match, ``ProgramNotSolved`` when IPOPT gives up, naming actions whose avoidance needs infinite weights
-        if there are any, and ``ValueError`` for a malformed target.
+        close to their start. Raises ``InfeasibleProgram`` naming the features that no policy can match,
+        ``ProgramNotSolved`` if IPOPT fails, naming actions whose avoidance needs infinite weights if there
+        are any, and ``ValueError`` for a malformed target.
         """
         features, start, beta = checked_problem(self.mdp, target, slack)
         problem = _Problem(start, features / self._scale, beta, float(ridge), ~self._reachable(start))
@@ -288,7 +288,7 @@ class DualProgram(_SoftBellmanProgram):
     def _reachable(self, start: np.ndarray) -> np.ndarray:
         key = (start > 0).tobytes()
         if key not in self._reached:
-            # One entry: sessions start where the last one did, more often than not.
+            # One entry: sessions usually start where the last one did.
             self._reached = {key: reachable_states(self.mdp, start)}
         return self._reached[key]
 
@@ -311,7 +311,7 @@ class CountProgram(_SoftBellmanProgram):
         """Solve for counts ``[S, A]``, from ``warm`` or zero weights; ``objective`` is minus the maximum.
 
         Penalties are in nats, of scaled weights (:mod:`~i2rl.models.process.units`). Raises
-        ``ProgramNotSolved`` when IPOPT gives up, and ``ValueError`` for counts that are negative, not finite,
+        ``ProgramNotSolved`` if IPOPT fails, and ``ValueError`` for counts that are negative, not finite,
         of unavailable pairs or of the wrong shape.
         """
         visits = np.asarray(counts, float)
@@ -342,7 +342,7 @@ class CountProgram(_SoftBellmanProgram):
 
 
 def soft_maximum(advantage: ca.SX, state: np.ndarray) -> ca.SX:
-    """``log sum_a exp(advantage)`` of each state, exponents shifted so that the largest is zero."""
+    """Build ``log sum_a exp(advantage)`` of each state, exponents shifted so that the largest is zero."""
     maxima = []
     for s in range(state[-1] + 1):
         own = advantage[np.flatnonzero(state == s).tolist()]

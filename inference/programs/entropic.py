@@ -10,7 +10,7 @@ from jax.scipy.special import xlogy
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-# The equation for the largest proportion has one or two solutions that are maxima, looked for on this grid.
+# The equation for the largest proportion has one or two solutions that are maxima, searched on this grid.
 _GRID = 64
 _BISECTIONS = 54
 # From the bound of _above_one, eight Newton steps reach rounding for every right-hand side.
@@ -19,25 +19,25 @@ _NO_STRENGTH = 1e-14
 
 
 def entropic_proportions(counts: Float[ArrayLike, " D"], strength: ArrayLike) -> Float[Array, " D"]:
-    """The proportions that maximise ``sum_d n_d log pi_d + strength * sum_d pi_d log pi_d``.
+    """Maximise ``sum_d n_d log pi_d + strength * sum_d pi_d log pi_d`` over proportions.
 
-    That is the mode of the posterior of mixture weights after (expected) counts ``n`` under the entropic
-    prior ``p(pi) ~ exp(-strength H(pi))``, which prefers few components. Fixed shapes: works under ``jit``,
-    ``vmap`` and ``scan``, where bad arguments cannot be reported.
+    The maximum is the mode of the posterior of mixture weights after (expected) counts ``n`` under the
+    entropic prior ``p(pi) ~ exp(-strength H(pi))``, which prefers few components. Fixed shapes: works under
+    ``jit``, ``vmap`` and ``scan``, where bad arguments cannot raise.
 
     At a maximum ``n_d / pi_d + strength log pi_d`` is the same for every ``d``. It falls with ``pi_d`` up to
-    ``n_d / strength``, where a component's share of the objective is concave, and rises beyond. Where some
+    ``n_d / strength``, where a component's share of the objective is concave, and rises beyond. If some
     ``n_d < strength`` the problem is thus not concave. At a maximum at most one component is on its rising
-    branch, and it has the largest count: proportions are in the order of the counts (exchanging two
-    changes the entropy not at all), so that ``n_d / pi_d <= n_max / pi_max``, were the one ``d`` rising and
-    the largest falling, would contradict ``n_d / pi_d < strength <= n_max / pi_max`` with equal sums. The
-    largest proportion therefore determines the others (by Newton's method on Lambert's equation), and is
-    itself found where they sum to one; of two such places the better one is returned.
+    branch, and it has the largest count. Proof: proportions are in the order of the counts (exchanging two
+    preserves the entropy), so that ``n_d / pi_d <= n_max / pi_max``. A rising ``d`` beside a falling largest
+    component would contradict ``n_d / pi_d < strength <= n_max / pi_max`` with equal sums. The largest
+    proportion therefore determines the others (by Newton's method on Lambert's equation), and is itself found
+    where they sum to one; of two such points the better one is returned.
 
     Parameters
     ----------
     counts : float ``[D]``
-        ``n_d >= 0``: how many trajectories each component has, fractions allowed. A component without any
+        ``n_d >= 0``: number of trajectories of each component, fractions allowed. A component with count zero
         has proportion zero.
     strength : float
         ``lambda >= 0``; zero returns ``n / sum n``.
@@ -45,8 +45,8 @@ def entropic_proportions(counts: Float[ArrayLike, " D"], strength: ArrayLike) ->
     Returns
     -------
     float ``[D]``
-        Sum one; uniform when all counts are zero. Among equal largest counts, with strength enough to tell
-        them apart, the first is preferred.
+        Sum one; uniform if all counts are zero. Among equal largest counts, with strength enough to break the
+        tie, the first is preferred.
 
     Raises
     ------
@@ -68,7 +68,7 @@ def entropic_proportions(counts: Float[ArrayLike, " D"], strength: ArrayLike) ->
 def entropic_objective(
     proportions: Float[Array, " D"], counts: Float[ArrayLike, " D"], strength: ArrayLike
 ) -> Float[Array, ""]:
-    """``sum_d n_d log pi_d + strength * sum_d pi_d log pi_d`` (nats), where ``0 log 0 = 0``."""
+    """Return ``sum_d n_d log pi_d + strength * sum_d pi_d log pi_d`` (nats), where ``0 log 0 = 0``."""
     likelihood = xlogy(jnp.asarray(counts, float), proportions).sum()
     return likelihood + jnp.asarray(strength, float) * xlogy(proportions, proportions).sum()
 
@@ -85,7 +85,7 @@ def _maximise(counts: Float[Array, " D"], strength: Float[Array, ""]) -> Float[A
     scale = jnp.where(weak, 1.0, strength)
 
     def follow(first: Float[Array, " Q"]) -> Float[Array, "Q D"]:
-        """All components' proportions, given the largest one."""
+        """Return all components' proportions, given the largest one."""
         # In x = n / (strength pi), stationarity says x - log x = constant - log n.
         ratio = most / (scale * first)
         excess = ratio - 1.0
@@ -97,7 +97,7 @@ def _maximise(counts: Float[Array, " D"], strength: Float[Array, ""]) -> Float[A
 
     low = most / jnp.where(some, total, 1.0)
     grid = jnp.linspace(low, 1.0, _GRID)
-    # By the bounds of the largest proportion, the sum does not exceed one at the first point, nor miss it at
+    # By the bounds of the largest proportion, the sum is at most one at the first point and at least one at
     # the last; rounding must not hide that.
     enough = (follow(grid).sum(1) >= 1.0).at[0].set(False).at[-1].set(True)
     crossing = ~enough[:-1] & enough[1:]
@@ -119,7 +119,7 @@ def _maximise(counts: Float[Array, " D"], strength: Float[Array, ""]) -> Float[A
 
 
 def _above_one(depth: Float[Array, " n"]) -> Float[Array, " n"]:
-    """``w >= 0`` with ``w - log(1 + w) = depth``: Lambert's ``-W_{-1}(-exp(-1 - depth)) - 1``."""
+    """Solve ``w - log(1 + w) = depth`` for ``w >= 0``: Lambert's ``-W_{-1}(-exp(-1 - depth)) - 1``."""
     root = jnp.sqrt(2.0 * depth)
     # An upper bound (Chatzigeorgiou 2013), from which Newton's method on a convex function only descends.
     start = root + depth

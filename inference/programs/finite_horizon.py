@@ -7,9 +7,9 @@ is the soft policy of some reward ``theta . phi`` (Ziebart 2010, chapters 6 and 
     D(theta) = E_{p0}[V_theta(s_0)] - theta . phi_hat,
     dD/dtheta = E_{pi_theta}[sum_t gamma^t phi_t] - phi_hat.
 
-One backward sweep gives the value, one forward sweep the gradient. For deterministic dynamics and discount
-1 the law found is the dissertation's ``P(X) ~ exp(theta . f(X))`` (Eq. 2.2); otherwise Eq. 2.2 would let
-the expert choose chance outcomes, and this is the law that does not.
+One backward pass gives the value, one forward pass the gradient. For deterministic dynamics and discount
+1 the resulting law is the dissertation's ``P(X) ~ exp(theta . f(X))`` (Eq. 2.2). Otherwise Eq. 2.2 would let
+the expert choose chance outcomes, and this law does not.
 
 The minimiser is unique up to directions that no policy can influence (a constant added to every reward,
 say): the policy is unique, the weights are one choice among those that give it.
@@ -32,17 +32,17 @@ from ...models.process.mdp import TabularMDP
 from ...models.process.planning import finite_hard_plan, finite_occupancy, finite_soft_plan, reward_of
 from ...models.process.units import feature_scale, with_scaled_features
 
-# Up to so many features Newton finishes what L-BFGS leaves: its Hessian costs K tangent sweeps.
+# Up to this number of features Newton finishes what L-BFGS leaves: its Hessian costs K tangent passes.
 NEWTON_LIMIT = 64
 _MAX_EVALUATIONS = 2000
-# Rewards so large (in nats) run off to infinity: the target lies outside what policies can collect.
+# Larger rewards (in nats) diverge: the target lies outside what policies can collect.
 _DIVERGED = 1e7
 _MAX_NEWTON_STEPS = 50
 _MAX_HALVINGS = 30
 
 
 class UnmatchedError(RuntimeError):
-    """No weights were found whose policy collects what was asked for; says which feature stands out."""
+    """Target that no weights were found to match; the message names the worst feature."""
 
 
 @shown_briefly
@@ -54,12 +54,12 @@ class CausalEntropyFit(NamedTuple):
     weights : float ``[K]``
         Feature weights ``theta``, or the reward of every state (``K = S``).
     gap : float ``[K]``
-        What the policy collects minus what was asked for; at most the tolerance everywhere, in units of the
-        features' scales.
+        Features of the policy minus the target; at most the tolerance everywhere, in units of the features'
+        scales.
     value : float
         The dual ``D(theta)``; at the optimum, the (discounted) causal entropy of the policy, in nats.
     evaluations : int
-        Pairs of sweeps made (Hessians are not counted).
+        Number of forward-backward passes (without Hessians).
     """
 
     weights: Float[np.ndarray, " K"]
@@ -70,7 +70,7 @@ class CausalEntropyFit(NamedTuple):
 
 @partial(jax.jit, static_argnames="horizon")
 def discounted_visits(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int) -> tuple[Array, Array]:
-    """Soft value and visits of the finite-horizon soft policy of a reward.
+    """Return the soft value and visits of the finite-horizon soft policy of a reward.
 
     Returns
     -------
@@ -86,24 +86,24 @@ def discounted_visits(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int
 
 
 def state_reward(mdp: TabularMDP, rewards: Float[Array, " S"]) -> Float[Array, "S A"]:
-    """The reward of every pair when it depends on the state alone."""
+    """Build the reward of every pair from a reward of the state alone."""
     return jnp.broadcast_to(rewards[:, None], (mdp.n_states, mdp.n_actions))
 
 
 @partial(jax.jit, static_argnames="horizon")
 def expected_features(mdp: TabularMDP, weights: Float[Array, " K"], horizon: int) -> Float[Array, " K"]:
-    """``E[sum_{t < T} gamma^t phi(s_t, a_t)]`` under the soft policy of ``weights``.
+    """Return ``E[sum_{t < T} gamma^t phi(s_t, a_t)]`` under the soft policy of ``weights``.
 
-    What :func:`fit_weights` inverts.
+    This is the inverse of :func:`fit_weights`.
     """
     return jnp.einsum("sa,sak->k", discounted_visits(mdp, reward_of(mdp, weights), horizon)[1], mdp.features)
 
 
 @partial(jax.jit, static_argnames="horizon")
 def expected_visits(mdp: TabularMDP, rewards: Float[Array, " S"], horizon: int) -> Float[Array, " S"]:
-    """``sum_{t < T} gamma^t P(s_t = s)`` under the soft policy of state rewards.
+    """Return ``sum_{t < T} gamma^t P(s_t = s)`` under the soft policy of state rewards.
 
-    What :func:`fit_state_rewards` inverts.
+    This is the inverse of :func:`fit_state_rewards`.
     """
     return jnp.sum(discounted_visits(mdp, state_reward(mdp, rewards), horizon)[1], axis=1)
 
@@ -112,7 +112,7 @@ def expected_visits(mdp: TabularMDP, rewards: Float[Array, " S"], horizon: int) 
 def feature_dual(
     mdp: TabularMDP, weights: Float[Array, " K"], target: Float[Array, " K"], horizon: int
 ) -> tuple[Array, Array]:
-    """The dual ``D(theta)`` and its gradient ``[K]``, the feature gap."""
+    """Return the dual ``D(theta)`` and its gradient ``[K]``, the feature gap."""
     value, visits = discounted_visits(mdp, reward_of(mdp, weights), horizon)
     return value - weights @ target, jnp.einsum("sa,sak->k", visits, mdp.features) - target
 
@@ -121,14 +121,14 @@ def feature_dual(
 def _state_dual(
     mdp: TabularMDP, rewards: Float[Array, " S"], target: Float[Array, " S"], horizon: int
 ) -> tuple[Array, Array]:
-    # The same dual for one-hot state features, which are never written out.
+    # The same dual for one-hot state features, which are never built.
     value, visits = discounted_visits(mdp, state_reward(mdp, rewards), horizon)
     return value - rewards @ target, jnp.sum(visits, axis=1) - target
 
 
 @partial(jax.jit, static_argnames="horizon")
 def _feature_curvature(mdp: TabularMDP, weights: Float[Array, " K"], horizon: int) -> Float[Array, " K"]:
-    # Second moments of the features under the visits: the Hessian's diagonal, correlations left out.
+    # Second moments of the features under the visits: the Hessian's diagonal without correlations.
     return jnp.einsum(
         "sa,sak->k", discounted_visits(mdp, reward_of(mdp, weights), horizon)[1], mdp.features**2
     )
@@ -149,9 +149,9 @@ def fit_weights(
     tolerance: float = 1e-6,
     start: Float[np.ndarray, " K"] | None = None,
 ) -> CausalEntropyFit:
-    """Weights of the state-action features whose soft policy collects ``target``.
+    """Fit weights of the state-action features whose soft policy collects ``target``.
 
-    L-BFGS on the dual; where its line search runs out of digits before the tolerance is met, Newton's
+    L-BFGS on the dual; if its line search runs out of digits before the tolerance is met, Newton's
     method finishes (up to ``NEWTON_LIMIT`` features).
 
     Parameters
@@ -164,7 +164,7 @@ def fit_weights(
         ``phi_hat``, the expert's ``E[sum_{t < T} gamma^t phi(s_t, a_t)]``. From demonstrations of length
         ``T``: ``expectations(...).features / expectations(...).size``.
     tolerance : float
-        Largest gap left in any feature, in units of its scale (:mod:`~i2rl.models.process.units`). For
+        Largest remaining gap of any feature, in units of its scale (:mod:`~i2rl.models.process.units`). For
         targets averaged over few demonstrations it is the slack of the relaxed constraint: set it to the
         sampling error and the weights stay finite.
     start : float ``[K]``, optional
@@ -173,9 +173,9 @@ def fit_weights(
     Raises
     ------
     ValueError
-        Wrong shapes, a horizon below 1, targets that are no numbers.
+        For wrong shapes, a horizon below 1, and targets that are not numbers.
     UnmatchedError
-        No policy collects the target, or the tolerance is finer than the arithmetic; names the feature.
+        If no policy collects the target, or the tolerance is finer than the arithmetic; names the feature.
     """
     _check(horizon, tolerance)
     target = _vector("target", target, mdp.n_features, "features")
@@ -184,8 +184,8 @@ def fit_weights(
     )
     scale, scaled = np.asarray(feature_scale(mdp)), with_scaled_features(mdp)
     wanted = target / scale
-    # A single sweep scatters faster than it gathers (twice, at 1024 states), and processes of one size then
-    # share one compiled program. The Hessian, many sweeps side by side, keeps the gather: 6 times faster.
+    # A single pass scatters faster than it gathers (twice, at 1024 states), and processes of one size then
+    # share one compiled program. The Hessian, many passes side by side, uses the gather: 6 times faster.
     dual = partial(_evaluate, feature_dual, scaled.without_inflow(), wanted, horizon)
     curvature = np.asarray(_feature_curvature(scaled.without_inflow(), weights * scale, horizon))
     fit = _lbfgs(dual, curvature, weights * scale, tolerance)
@@ -195,9 +195,12 @@ def fit_weights(
         )
     fit = fit._replace(weights=fit.weights / scale, gap=fit.gap * scale)
     _require_matched(
-        fit, target, tolerance * scale, lambda k: f"feature {mdp.feature_names[k]!r}",
+        fit,
+        target,
+        tolerance * scale,
+        lambda k: f"feature {mdp.feature_names[k]!r}",
         partial(_feature_range, mdp, horizon),
-    )  # fmt: skip
+    )
     return fit
 
 
@@ -209,7 +212,7 @@ def fit_state_rewards(
     tolerance: float = 1e-6,
     start: Float[np.ndarray, " S"] | None = None,
 ) -> CausalEntropyFit:
-    """One reward per state such that the soft policy visits the states as often as the expert.
+    """Fit one reward per state whose soft policy visits the states as often as the expert.
 
     The special case of one-hot state features, by L-BFGS, without writing the features out; ``mdp.features``
     is not used. Variables are scaled by the square root of the target, the curvature's order of magnitude.
@@ -221,15 +224,15 @@ def fit_state_rewards(
     target : float ``[S]``
         The expert's ``sum_{t < T} gamma^t P(s_t = s)``; it sums to ``sum_{t < T} gamma^t``.
     tolerance : float
-        Largest gap left in any state's visits. Below about 1e-8 the dual's value has no more digits for
+        Largest remaining gap of any state's visits. Below about 1e-8 the dual's value has no more digits for
         the line search.
 
     Raises
     ------
     ValueError
-        As for :func:`fit_weights`, and for a target that is negative or sums to something else.
+        As for :func:`fit_weights`, and for a target that is negative or has another sum.
     UnmatchedError
-        No policy visits the states so, or the tolerance is finer than the arithmetic; names the state.
+        If no policy has these visits, or the tolerance is finer than the arithmetic; names the state.
     """
     _check(horizon, tolerance)
     target = _vector("target", target, mdp.n_states, "states")
@@ -246,9 +249,12 @@ def fit_state_rewards(
     dual = partial(_evaluate, _state_dual, mdp.without_inflow(), target, horizon)
     fit = _lbfgs(dual, target, rewards, tolerance)
     _require_matched(
-        fit, target, np.full(mdp.n_states, tolerance), lambda s: f"state {mdp.state_names[s]!r}",
+        fit,
+        target,
+        np.full(mdp.n_states, tolerance),
+        lambda s: f"state {mdp.state_names[s]!r}",
         partial(_visits_range, mdp, horizon),
-    )  # fmt: skip
+    )
     return fit
 
 
@@ -272,16 +278,16 @@ def _evaluate(
 def _newton(
     dual: _Dual, hessian: Callable[[np.ndarray], np.ndarray], fit: CausalEntropyFit, tolerance: float
 ) -> CausalEntropyFit:
-    """Newton on ``gap = 0`` from an earlier fit, halving each step until the gap's norm shrinks.
+    """Run Newton on ``gap = 0`` from an earlier fit, halving each step until the gap's norm shrinks.
 
-    The Newton direction always descends on that norm, and unlike the dual's value it keeps its digits
-    near the solution.
+    The Newton direction always descends on that norm, which unlike the dual's value has all its digits near
+    the solution.
     """
     weights, gap, value, evaluations = fit
     for _ in range(_MAX_NEWTON_STEPS):
         if np.abs(gap).max() <= tolerance:
             break
-        # Least squares: directions no policy can influence get no step.
+        # Least squares: the step is zero in directions that no policy can influence.
         step = -np.linalg.lstsq(hessian(weights), gap, rcond=1e-12)[0]
         for halving in range(_MAX_HALVINGS):
             length = 0.5**halving
@@ -296,7 +302,7 @@ def _newton(
 
 
 def _lbfgs(dual: _Dual, curvature: np.ndarray, weights: np.ndarray, tolerance: float) -> CausalEntropyFit:
-    """L-BFGS on the dual in variables scaled by the square root of a guess of its diagonal curvature."""
+    """Run L-BFGS on the dual, variables scaled by the root of an estimate of its diagonal curvature."""
     scale = np.sqrt(np.maximum(curvature, 1e-3 * curvature.mean() + 1e-12))
     latest = (weights, *dual(weights))
     evaluations = 1
@@ -314,9 +320,13 @@ def _lbfgs(dual: _Dual, curvature: np.ndarray, weights: np.ndarray, tolerance: f
 
     if np.abs(latest[2]).max() > tolerance:
         optimize.minimize(
-            scaled, weights * scale, jac=True, method="L-BFGS-B", callback=stop,
+            scaled,
+            weights * scale,
+            jac=True,
+            method="L-BFGS-B",
+            callback=stop,
             options={"ftol": 0.0, "gtol": 0.0, "maxiter": _MAX_EVALUATIONS, "maxfun": _MAX_EVALUATIONS},
-        )  # fmt: skip
+        )
     final, value, gap = latest
     return CausalEntropyFit(final, gap, value, evaluations)
 
@@ -345,7 +355,7 @@ def _vector(what: str, given: np.ndarray, length: int, of: str) -> np.ndarray:
 
 @partial(jax.jit, static_argnames="horizon")
 def _attainable(mdp: TabularMDP, horizon: int, feature: Float[Array, "S A"]) -> tuple[Array, Array]:
-    """Least and greatest expectation of one feature's discounted sum, over all policies."""
+    """Return the least and greatest expectation of one feature's discounted sum, over all policies."""
     least, most = (mdp.initial @ finite_hard_plan(mdp, sign * feature, horizon).values[0] for sign in (-1, 1))
     return 0.0 - least, most
 

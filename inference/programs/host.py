@@ -1,4 +1,4 @@
-"""The M-step posed in CasADi or CVXPY: programs built once, re-solved every session."""
+"""The M-step in CasADi or CVXPY: programs built once, re-solved every session."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Solve = Callable[[Any, Any, Any, Any], tuple[Any, Any]]
 
 
 def host_solver(mdp: TabularMDP, solver: str, statistic: str) -> tuple[Solve, Any]:
-    """The solver as ``solve(statistic, slack, ridge, warm) -> (solution, warm)``, and its first warm start.
+    """Return the solver ``solve(statistic, slack, ridge, warm) -> (solution, warm)``, and its first start.
 
     ``ipopt`` starts every solve from the primal and dual point of the last one, across sessions too;
     ``cvxpy`` re-solves its compiled primal.

@@ -1,12 +1,12 @@
-"""The maximum-entropy program (Eq. 2.4 with relaxed constraints), stated, and solved matrix-free in JAX.
+"""The maximum-entropy program (Eq. 2.4 with relaxed constraints), and its matrix-free solution in JAX.
 
 Among all policies whose expected features are within ``slack`` of the expert's, find the one of largest
 causal entropy. Its Lagrange multipliers are the reward weights. Three forms of the one program agree:
 
 - primal, over occupancies, in CVXPY: :mod:`~i2rl.inference.programs.primal`;
 - dual, over weights and values, in CasADi with IPOPT: :mod:`~i2rl.inference.programs.dual`;
-- dual, over the weights alone, values by soft planning: here. It compiles, so that fleets of learners
-  may be mapped with ``vmap``, and needs no more memory than the features, so that it scales.
+- dual, over the weights alone, values by soft planning: here. It compiles, so that ``vmap`` maps fleets of
+  learners, and needs no more memory than the features, so that it scales.
 
 The dual is ``min_theta p0.V_theta - theta.phi_hat + sum_k slack_k |theta_k| + ridge/2 |theta|^2``. The
 slack of the constraints is the L1 penalty of the weights, as in the proofs of Theorems 1 and 3, where
@@ -15,7 +15,8 @@ function of values and weights), and is solved by the same iterations.
 
 Every solver divides each feature by its scale first (:mod:`~i2rl.models.process.units`), and multiplies
 weights by it: ``slack`` and ``ridge`` penalise scaled weights, tolerances are relative to scaled features,
-and no answer depends on the units of a feature. Weights go in and come out as those of the features as given.
+and results do not depend on the units of a feature. Arguments and results are weights of the original
+features.
 """
 
 from __future__ import annotations
@@ -49,16 +50,16 @@ _MAX_HALVINGS = 40
 # converged (as IPOPT's tolerances): rounding may stop it in between when the discount is close to 1.
 _TARGET_RESIDUAL = 1e-10
 _ACCEPTED_RESIDUAL = 1e-7
-# Where the quadratic model's steps prove too long, it is damped (Levenberg 1944).
+# The quadratic model is damped if its steps prove too long (Levenberg 1944).
 _LEAST_DAMPING = 1e-2
 _LARGEST_DAMPING = 1e4
-# One step changes no reward by more than this many nats: beyond it the quadratic model says nothing.
+# One step changes a reward by at most this many nats: beyond it the quadratic model is invalid.
 _MAX_REWARD_CHANGE = 50.0
 
 
 @shown_briefly
 class WarmStart(NamedTuple):
-    """Where to begin: ``weights [K]``, and ``values [S]`` close to their soft values."""
+    """Start of a solver: ``weights [K]``, and ``values [S]`` close to their soft values."""
 
     weights: Float[Array, " K"]
     values: Float[Array, " S"]
@@ -77,11 +78,11 @@ class Solution(NamedTuple):
     objective : float
         The minimised objective, penalties included (nats).
     residual : float
-        Violation of the optimality (KKT) conditions by scaled weights, relative to what was matched.
+        Violation of the optimality (KKT) conditions by scaled weights, relative to the target.
     iterations : int
         Newton iterations (gradient steps for the exponentiated gradient).
     converged : bool
-        Whether the residual met the tolerance.
+        True if the residual met the tolerance.
     """
 
     weights: Float[Array, " K"]
@@ -92,7 +93,7 @@ class Solution(NamedTuple):
     converged: Bool[Array, ""]
 
     def warm(self) -> WarmStart:
-        """The point to start the next session from."""
+        """Return the start for the next session."""
         return WarmStart(self.weights, self.values)
 
 
@@ -105,11 +106,11 @@ def solve_dual(
 ) -> Solution:
     """Solve the feature program's dual, ``min p0.V - theta.phi_hat + slack.|theta| + ridge/2 |theta|^2``.
 
-    Proximal Newton method with the exact Hessian, ``sum_s occupancy(s) Cov_{a ~ pi(.|s)} dQ(s, .)``. Where
-    weights are not unique (dependent features without slack) it stays close to where it started. Works
-    under ``jit`` and ``vmap``, where nothing can be raised: look at ``converged``, or hand the solution to
+    Proximal Newton method with the exact Hessian, ``sum_s occupancy(s) Cov_{a ~ pi(.|s)} dQ(s, .)``. If
+    weights are not unique (dependent features without slack) it stays close to its start. Works under ``jit``
+    and ``vmap``, where errors cannot be raised: check ``converged``, or pass the solution to
     :func:`require_converged`. A target that only a deterministic policy meets has infinite weights without
-    slack or ridge; what comes back then is large enough to meet the tolerance, and means no more.
+    slack or ridge; the result is then large enough to meet the tolerance, and otherwise arbitrary.
 
     Parameters
     ----------
@@ -118,8 +119,8 @@ def solve_dual(
     target : FeatureTarget
         Features to match and the distribution of the first state.
     slack : float or ``[K]``
-        ``beta_k >= 0``: how far expected features may be from the target, in units of each feature's scale
-        (:func:`~i2rl.models.process.units.feature_scale`).
+        ``beta_k >= 0``: largest distance of expected features from the target, in units of each feature's
+        scale (:func:`~i2rl.models.process.units.feature_scale`).
     ridge : float
         Quadratic penalty on the scaled weights.
     start : WarmStart or None
@@ -146,7 +147,7 @@ def solve_scaled_dual(
     ridge: ArrayLike = 0.0,
     start: WarmStart | None = None,
 ) -> Solution:
-    """Solve :func:`solve_dual`'s program for a process whose features are scaled already."""
+    """Solve :func:`solve_dual`'s program for a process with scaled features."""
     objective = LinearObjective(jnp.asarray(target.start, float), jnp.asarray(target.features, float))
     return minimise(mdp, objective, shaped_slack(mdp, slack), jnp.asarray(ridge, float), start)
 
@@ -160,8 +161,8 @@ def fit_counts(
 ) -> Solution:
     """Maximise the likelihood of visits, ``sum N log pi_theta - slack.|theta| - ridge/2 |theta|^2``.
 
-    ``objective`` is minus that, in nats. The same iterations as :func:`solve_dual`, with the convex part of
-    the Hessian (the program is not convex: with few counts it may have several stationary points, and one
+    ``objective`` is minus that, in nats. The iterations are those of :func:`solve_dual`, with the convex part
+    of the Hessian (the program is not convex: with few counts it may have several stationary points, and one
     downhill from the start is returned).
 
     Parameters
@@ -194,7 +195,7 @@ def fit_scaled_counts(
     ridge: ArrayLike = 0.0,
     start: WarmStart | None = None,
 ) -> Solution:
-    """Solve :func:`fit_counts`'s program for a process whose features are scaled already."""
+    """Solve :func:`fit_counts`'s program for a process with scaled features."""
     return minimise(
         mdp, count_objective(mdp, counts), shaped_slack(mdp, slack), jnp.asarray(ridge, float), start
     )
@@ -212,7 +213,7 @@ def _unscaled(solution: Solution, scale: Float[Array, " K"]) -> Solution:
 def soft_values(
     mdp: TabularMDP, weights: Float[Array, " K"], start: Float[Array, " S"] | None = None
 ) -> Float[Array, " S"]:
-    """Soft values ``V_theta [S]`` of reward weights; ``start`` as for :func:`soft_plan`."""
+    """Return soft values ``V_theta [S]`` of reward weights; ``start`` as for :func:`soft_plan`."""
     return soft_plan(mdp, reward_of(mdp, weights), start).values
 
 
@@ -232,7 +233,7 @@ class LinearObjective(NamedTuple):
 
 
 def count_objective(mdp: TabularMDP, counts: ArrayLike) -> LinearObjective:
-    """Minus the conditional log-likelihood: ``sum N (V - Q) = (n - gamma P'N).V - theta.sum N phi``."""
+    """Build minus the conditional log-likelihood: ``sum N (V - Q) = (n - gamma P'N).V - theta.sum N phi``."""
     counts = jnp.asarray(counts, float)
     if counts.shape != mdp.available.shape:
         raise ValueError(
@@ -260,14 +261,14 @@ def expand(
     q = mdp.features @ weights + mdp.discount * mdp.expect_next(values)
     policy = jax.nn.softmax(jnp.where(mdp.available, q, -jnp.inf), axis=1)
     to_go = features_to_go(mdp, policy)
-    # Visits that are not the policy's own leave negative occupancies somewhere. Without them the model stays
-    # convex, and above the objective to second order.
+    # Visits of another policy give some states negative occupancies. Without these the model stays convex,
+    # and above the objective to second order.
     information = jnp.maximum(occupancy(mdp, policy, objective.state_weights).sum(1), 0.0)
     next_to_go = jax.vmap(mdp.expect_next, in_axes=1, out_axes=2)(to_go)
     deviation = (mdp.features + mdp.discount * next_to_go - to_go[:, None]).reshape(-1, mdp.n_features)
     weighted = (information[:, None] * policy).reshape(-1, 1) * deviation
     expected = objective.state_weights @ to_go
-    # What the gradient is a difference of: the features themselves, without their sign.
+    # The terms whose difference is the gradient: the features themselves, without their sign.
     scale = jnp.max(jnp.abs(objective.features) + jnp.abs(objective.state_weights) @ jnp.abs(to_go))
     return _Expansion(expected - objective.features, weighted.T @ deviation, to_go, scale)
 
@@ -275,10 +276,10 @@ def expand(
 def count_information(
     mdp: TabularMDP, counts: Float[Array, "S A"], weights: Float[Array, " K"], values: Float[Array, " S"]
 ) -> Float[Array, "K K"]:
-    """Information about the weights in visits ``counts [S, A]``: minus the Hessian of their log-likelihood.
+    """Return the information about weights in visits ``counts [S, A]``: minus the log-likelihood's Hessian.
 
-    At weights whose soft values are ``values [S]``. Positive semi-definite always; exact where the visits
-    flow as the soft policy's would.
+    It is taken at weights whose soft values are ``values [S]``. It is always positive semi-definite, and
+    exact if the visits flow as the soft policy's would.
     """
     return expand(mdp, count_objective(mdp, counts), weights, values).hessian
 
@@ -286,7 +287,7 @@ def count_information(
 def _kkt_residual(
     slope: Float[Array, " K"], slack: Float[Array, " K"], weights: Float[Array, " K"]
 ) -> Float[Array, ""]:
-    """Distance of zero from the subdifferential ``slope + slack d|weights|``, the largest over features."""
+    """Return the distance of zero from ``slope + slack d|weights|``, the largest over features."""
     at_zero = jnp.maximum(jnp.abs(slope) - slack, 0.0)
     return jnp.max(jnp.where(weights == 0, at_zero, jnp.abs(slope + slack * jnp.sign(weights))))
 
@@ -323,7 +324,7 @@ def minimise(
     ridge: Float[Array, ""],
     start: WarmStart | None,
 ) -> Solution:
-    """Proximal Newton: quadratic model of the smooth part, exact L1, line search on the true objective."""
+    """Run proximal Newton: quadratic model of the smooth part, exact L1, line search on the objective."""
 
     def penalty(weights: Float[Array, " K"]) -> Float[Array, ""]:
         return slack @ jnp.abs(weights) + 0.5 * ridge * weights @ weights
@@ -352,7 +353,7 @@ def minimise(
         slope = at.gradient + ridge * now.weights
         move = quadratic_l1(curvature, slope, slack, now.weights, 1e-12 * at.scale) - now.weights
         change = slope @ move + slack @ (jnp.abs(now.weights + move) - jnp.abs(now.weights))
-        # Sums of this size are what the objective is a difference of: a change below it is not seen.
+        # The objective is a difference of sums of this size: it cannot resolve smaller changes.
         size = jnp.abs(objective.state_weights) @ jnp.abs(now.values) + jnp.abs(
             objective.features @ now.weights
         )
@@ -423,10 +424,10 @@ def quadratic_l1(
 ) -> Float[Array, " K"]:
     """Minimise ``slope.(w - origin) + (w - origin)' curvature (w - origin) / 2 + sum slack |w|``.
 
-    Sweeps of coordinate descent find which weights are zero and the signs of the others; after each sweep
-    the weights go to the exact solution for that guess, or as far as it holds. ``curvature`` may be
-    singular: a relative damping of 1e-8 keeps to the origin in directions it says nothing about. Stops
-    when the optimality conditions hold to ``tolerance``.
+    Coordinate descent finds which weights are zero and the signs of the others; after each pass the weights
+    go to the exact solution for that guess, or as far as it holds. ``curvature`` may be singular: a relative
+    damping of 1e-8 stays at the origin in its null space. Stops when the optimality conditions hold to
+    ``tolerance``.
     """
     n = slope.shape[0]
     damping = 1e-8 * jnp.max(jnp.diag(curvature)) + 1e-200
@@ -448,7 +449,7 @@ def quadratic_l1(
         block = jnp.where(active[:, None] & active, curvature, jnp.eye(n))
         pull = curvature @ jnp.where(active, 0.0, origin) - slope - slack * jnp.sign(w)
         exact = jnp.where(active, origin + jnp.linalg.solve(block, jnp.where(active, pull, 0.0)), 0.0)
-        # On the way there the signs must hold: the first weight to change its sign stays at zero.
+        # On the path the signs must hold: the first weight to change its sign stays at zero.
         crossing = (slack > 0) & active & (exact * w <= 0)
         share = jnp.where(crossing, w / jnp.where(crossing, w - exact, 1.0), 1.0)
         reach = jnp.min(share)
@@ -474,17 +475,18 @@ def exponentiated_gradient(
     start: Float[Array, " K"] | None = None,
     max_steps: int = 10_000,
 ) -> Solution:
-    """Normalised exponentiated gradient on the simplex, lines 12-18 of Algorithm 1.
+    """Run normalised exponentiated gradient on the simplex, lines 12-18 of Algorithm 1.
 
-    ``theta_k <- theta_k exp(learning_rate z_k) / sum_j theta_j exp(rate z_j)`` with ``z = phi_hat - E[phi]``,
-    until ``max_k |z_k| <= epsilon / (1 - gamma)``. Two deviations: line 16 prints ``exp(-eta z)``, which with
-    the ``z`` of line 15 descends the likelihood (the dissertation's code has ``exp(-2c (E[phi] - phi_hat))``,
-    the sign used here); and ``E[phi]`` of line 14 is exact, not an average of sampled trajectories.
+    ``theta_k <- theta_k exp(learning_rate z_k) / sum_j theta_j exp(learning_rate z_j)`` with
+    ``z = phi_hat - E[phi]``, until ``max_k |z_k| <= epsilon / (1 - gamma)``. Two deviations: line 16 prints
+    ``exp(-eta z)``, which with the ``z`` of line 15 descends the likelihood (the dissertation's code has
+    ``exp(-2c (E[phi] - phi_hat))``, the sign used here); and ``E[phi]`` of line 14 is exact, not an average
+    of sampled trajectories.
 
     Scaled weights stay positive and sum to one. The solver therefore cannot express a negative weight, nor
-    how deterministic the expert is (the length of the weight vector), and for most experts no point of the
-    simplex meets the stopping rule: it then ends after ``max_steps`` with ``converged`` false. Kept to
-    replicate; :func:`solve_dual` solves the program the theorems are about.
+    the expert's rationality (the length of the weight vector), and for most experts no point of the simplex
+    meets the stopping rule: it then ends after ``max_steps`` with ``converged`` false. It serves replication
+    only; :func:`solve_dual` solves the program of the theorems.
 
     Parameters
     ----------
@@ -493,7 +495,7 @@ def exponentiated_gradient(
     epsilon : float
         Tolerance per step, ``epsilon`` of Theorem 1, in units of each feature's scale.
     learning_rate : float or None
-        ``eta``, per unit of discounted scaled features; ``(1 - gamma) / 4`` by default.
+        The ``eta`` of line 16, per unit of discounted scaled features; ``(1 - gamma) / 4`` by default.
     start : float ``[K]`` or None
         Weights of the previous session, all positive; equal scaled weights by default. Normalised before use.
     max_steps : int
@@ -524,7 +526,7 @@ def exponentiate_scaled(
     start: Float[Array, " K"] | None = None,
     max_steps: int = 10_000,
 ) -> Solution:
-    """Run :func:`exponentiated_gradient` on a process whose features are scaled already."""
+    """Run :func:`exponentiated_gradient` on a process with scaled features."""
     weights = jnp.ones(mdp.n_features) if start is None else jnp.asarray(start, float)
     if not isinstance(weights, jax.core.Tracer) and not (np.asarray(weights) > 0).all():
         raise ValueError(
@@ -576,7 +578,9 @@ def require_converged(
     """
     if not bool(solution.converged):
         raise failure(
-            mdp, target, slack,
+            mdp,
+            target,
+            slack,
             f"residual {float(solution.residual):.2g} after {int(solution.iterations)} Newton iterations",
-        )  # fmt: skip
+        )
     return solution

@@ -1,22 +1,23 @@
 """Min-max-entropy multi-task IRL (program 5.1, in its sound form) as one CasADi program with IPOPT.
 
-Each way of doing the task has a trajectory law of maximum entropy under its own feature matching; the
-mixture of these laws has proportions of little entropy. The Lagrange dual of the former is the likelihood
-of soft-optimal behaviour, and the latter is an entropic prior (:mod:`~i2rl.inference.programs.entropic`), so
-that the stationary points are those of::
+Each component has a trajectory law of maximum entropy under its own feature matching; the mixture of these
+laws has proportions of little entropy. The Lagrange dual of the former is the likelihood of soft-optimal
+behaviour, and the latter is an entropic prior (:mod:`~i2rl.inference.programs.entropic`), so that the
+stationary points are those of::
 
     maximise    sum_{i,d,s,a} v_id N_i(s, a) log pi_{theta_d}(a | s)
-                + price { sum_{i,d} v_id (log pi_d - log v_id) + strength sum_d pi_d log pi_d }
-                - l1 sum |theta| - ridge/2 sum theta^2
+                + temperature { sum_{i,d} v_id (log pi_d - log v_id) + strength sum_d pi_d log pi_d }
+                - slack sum |theta| - ridge/2 sum theta^2
     subject to  log sum_a exp(theta_d.phi(s, a) + gamma sum P(s' | s, a) V_d(s')) = V_d(s)
                 sum_d v_id = 1,  sum_d pi_d = 1,  v >= 0,  pi >= 0
 
 (the sums over ``s, a`` of trajectory ``i`` are ``theta_d.F_i - W_i.V_d``: only those are ever formed). Given
-the rest, and at ``temperature`` 1, the best ``v`` are the posterior probabilities of the ways, at which the
-maximised function is the marginal likelihood of the mixture; :mod:`~i2rl.inference.mixtures.fit` says why to
-pay less. Alternating between them, the proportions and the rewards ascends the same function; from the same
-start both mostly, but not always, end on the same of its hills. ``N_i`` is conditional on where a trajectory
-went: two ways that differ in one choice, made once, are a mixture no better than one way that tosses a coin.
+the rest, and at ``temperature`` 1, the best ``v`` are the posterior probabilities of the components, at which
+the maximised function is the marginal likelihood of the mixture; :mod:`~i2rl.inference.mixtures.fit` explains
+why a lower temperature is better. Alternating between them, the proportions and the rewards ascends the same
+function; from the same start both mostly, but not always, end in the same local maximum. ``N_i`` is
+conditional on the states of a trajectory: two components that differ in one choice, made once, are a mixture
+no better than one component that draws the choice at random.
 """
 
 from __future__ import annotations
@@ -47,10 +48,10 @@ _COLD: dict[str, Any] = {
     "show_eval_warnings": False,
     "calc_lam_p": False,
     "ipopt.tol": 1e-9,
-    # Logarithms of proportions must not be asked for below zero.
+    # Logarithms of proportions are undefined below zero.
     "ipopt.bound_relax_factor": 0.0,
 }
-# What IPOPT ends with at this tolerance: a warm start on the central path has nothing to recentre.
+# IPOPT's final barrier at this tolerance: a warm start on the central path needs no recentring.
 _WARM_BARRIER = 1e-10
 _WARM: dict[str, Any] = {
     **_COLD,
@@ -66,7 +67,7 @@ _WARM: dict[str, Any] = {
 
 @shown_briefly
 class MinMaxPoint(NamedTuple):
-    """A primal-dual point; what does not concern single trajectories starts the next session.
+    """A primal-dual point; all but the trajectories' own part starts the next session.
 
     Fields
     ------
@@ -75,10 +76,10 @@ class MinMaxPoint(NamedTuple):
         Positive and negative parts of the scaled weights.
     values : float ``[D, S]``
     proportion_multipliers, part_multipliers : float
-        Of their bounds; ``[D]`` and ``[D, 2K]``.
+        Multipliers of their bounds; ``[D]`` and ``[D, 2K]``.
     bellman_multipliers : float ``[D, S]``
     sum_multiplier : float
-        Of the proportions' sum.
+        Multiplier of the proportions' sum.
     """
 
     proportions: Float[np.ndarray, " D"]
@@ -97,19 +98,19 @@ class MinMaxSolution(NamedTuple):
     Fields
     ------
     weights : float ``[D, K]``
-        Reward weights of each way.
+        Reward weights of each component.
     values : float ``[D, S]``
         Their soft values.
     proportions : float ``[D]``
-        ``pi_d``; a component that died has one close to zero.
+        ``pi_d``; close to zero for an empty component.
     responsibilities : float ``[n, D]``
-        ``v_{d,i}``; at ``temperature`` 1 the posterior probabilities of the ways. Rows sum to one.
+        ``v_{d,i}``; at ``temperature`` 1 the posterior probabilities of the components. Rows sum to one.
     objective : float
         The maximised objective, penalties included (nats).
     iterations : int
-        Of IPOPT.
+        IPOPT's iterations.
     warm : MinMaxPoint
-        Where to start the next session from.
+        Start for the next session.
     """
 
     weights: Float[np.ndarray, "D K"]
@@ -122,7 +123,7 @@ class MinMaxSolution(NamedTuple):
 
 
 class _Statistics(NamedTuple):
-    """What the likelihood needs of every trajectory, per component: ``F [D, n, K]`` and ``W [D, n, S]``."""
+    """Statistics of each trajectory's likelihood, per component: ``F [D, n, K]`` and ``W [D, n, S]``."""
 
     features: Float[np.ndarray, "D n K"]
     state_weights: Float[np.ndarray, "D n S"]
@@ -136,7 +137,7 @@ class _Penalties(NamedTuple):
 
 
 class MinMaxProgram:
-    """The program above, built once for an MDP, ``components`` and at most so many ``trajectories``.
+    """The program above, built once for an MDP, ``components`` and at most this many ``trajectories``.
 
     Raises ``ValueError`` for discount 1, less than one component, or more components than trajectories.
     """
@@ -205,27 +206,27 @@ class MinMaxProgram:
         weights: ArrayLike | None = None,
         warm: MinMaxPoint | None = None,
     ) -> MinMaxSolution:
-        """A local maximum uphill from exactly one of three starts.
+        """Find a local maximum uphill from exactly one of three starts.
 
         Parameters
         ----------
         counts : float ``[n, S, A]`` or ``[D, n, S, A]``
-            Visits ``N_i`` of each trajectory; the latter are expected visits completed under each component
-            where steps are hidden.
+            Visits ``N_i`` of each trajectory; with ``D``, expected visits completed under each component,
+            for demonstrations with hidden steps.
         strength : float
             ``lambda`` of the entropic prior on the proportions.
         slack, ridge : float or ``[K]``, float
-            Penalties of each component's scaled weights (:mod:`~i2rl.models.process.units`), in nats in all
-            (a Laplace and a Gaussian prior).
+            Penalties of each component's scaled weights (:mod:`~i2rl.models.process.units`), in nats in
+            all (a Laplace and a Gaussian prior).
         temperature : float
-            What a nat of information of who did what costs, in nats of likelihood; more than zero.
+            Weight of a nat of the assignments' entropy, in nats of likelihood; more than zero.
         responsibilities : float ``[n, D]``
-            Start: who did what; each component begins at the best weights for its share.
+            Start: assignments; each component begins at the best weights for its share.
         weights : float ``[D, K]``
             Start: reward weights, with equal proportions.
         warm : MinMaxPoint
-            Start: the previous session's ``solution.warm``, the trajectories' own part computed anew. A
-            component that died there stays dead. Where it leads nowhere, its weights are started from, as
+            Start: the previous session's ``solution.warm``, the trajectories' own part computed anew. An
+            empty component stays empty. If this start fails, its weights are the start, as with
             ``weights``.
 
         Raises
@@ -233,7 +234,7 @@ class MinMaxProgram:
         ValueError
             For visits to unavailable pairs or malformed arguments, and unless there is one start.
         ProgramNotSolved
-            When IPOPT gives up.
+            If IPOPT fails.
         """
         statistics = self._statistics(counts)
         penalties = self._penalties(strength, temperature, slack, ridge)
@@ -265,11 +266,11 @@ class MinMaxProgram:
             raise ProgramNotSolved(
                 f"the min-max-entropy program was not solved: IPOPT reports {status} after "
                 f"{solution.iterations} iterations. Visits that a deterministic policy explains have "
-                "infinite weights: an l1 or a ridge makes them finite"
+                "infinite weights: a slack or a ridge makes them finite"
             )
         return solution
 
-    # -- what is given ------------------------------------------------------------------------------------
+    # -- arguments ------------------------------------------------------------------------------------------
 
     def _statistics(self, counts: ArrayLike) -> _Statistics:
         visits = np.asarray(counts, float)
@@ -302,7 +303,7 @@ class MinMaxProgram:
         slack = np.asarray(slack, float)
         if slack.shape not in ((), (self.mdp.n_features,)):
             raise ValueError(
-                f"l1 must be a number or have shape [K] = [{self.mdp.n_features}], got {list(slack.shape)}"
+                f"slack must be a number or have shape [K] = [{self.mdp.n_features}], got {list(slack.shape)}"
             )
         for name, value in (("strength", strength), ("slack", slack), ("ridge", ridge)):
             if not (np.isfinite(value) & (np.asarray(value) >= 0)).all():
@@ -320,7 +321,7 @@ class MinMaxProgram:
                 f"{name} must be finite numbers of shape {dims} = {list(shape)}, got {list(np.shape(given))}"
             )
 
-    # -- where to start -----------------------------------------------------------------------------------
+    # -- starts ---------------------------------------------------------------------------------------------
 
     def _at(
         self, weights: np.ndarray, proportions: np.ndarray, values: np.ndarray | None = None
@@ -330,9 +331,14 @@ class MinMaxProgram:
             origin = jnp.zeros(self.mdp.n_states)
             values = np.stack([soft_values(self._scaled, jnp.asarray(row), origin) for row in weights])
         return MinMaxPoint(
-            proportions, np.concatenate([np.maximum(weights, 0), np.maximum(-weights, 0)], axis=1), values,
-            np.zeros(n_components), np.zeros((n_components, 2 * n_features)), np.zeros_like(values), 0.0,
-        )  # fmt: skip
+            proportions,
+            np.concatenate([np.maximum(weights, 0), np.maximum(-weights, 0)], axis=1),
+            values,
+            np.zeros(n_components),
+            np.zeros((n_components, 2 * n_features)),
+            np.zeros_like(values),
+            0.0,
+        )
 
     def _from_responsibilities(
         self, shares: np.ndarray, counts: ArrayLike, penalties: _Penalties
@@ -382,23 +388,27 @@ class MinMaxProgram:
         v = np.full((self.trajectories, n_components), 1 / n_components)
         v[:n] = np.maximum(posterior, _WARM_BARRIER / 10)
         v /= v.sum(1, keepdims=True)
-        # Rows without a trajectory are held where they are. Without l1, plus and minus could grow together
-        # for nothing: plus alone is then the weight.
+        # Rows without a trajectory stay fixed. Without slack, plus and minus could grow together at no cost:
+        # plus alone is then the weight.
         held = np.broadcast_to(absent[:, None], v.shape)
         free = np.tile(slack == 0, (n_components, 1))
         zero, infinite = np.zeros_like(free, float), np.full(free.shape, np.inf)
         unbounded = np.full((n_components, n_states), np.inf)
         lower = _flat(
-            np.where(held, v, 0.0), np.zeros(n_components),
-            np.concatenate([np.where(free, -np.inf, 0.0), zero], axis=1).T, -unbounded.T,
-        )  # fmt: skip
+            np.where(held, v, 0.0),
+            np.zeros(n_components),
+            np.concatenate([np.where(free, -np.inf, 0.0), zero], axis=1).T,
+            -unbounded.T,
+        )
         upper = _flat(
-            np.where(held, v, np.inf), np.full(n_components, np.inf),
-            np.concatenate([infinite, np.where(free, 0.0, np.inf)], axis=1).T, unbounded.T,
-        )  # fmt: skip
+            np.where(held, v, np.inf),
+            np.full(n_components, np.inf),
+            np.concatenate([infinite, np.where(free, 0.0, np.inf)], axis=1).T,
+            unbounded.T,
+        )
         sums, bellman = np.ones(self.trajectories + 1), np.zeros(n_components * n_states)
         loose = np.append(absent, False)
-        # Stationarity in v gives the multipliers of its rows; interior v have none but the barrier's.
+        # Stationarity in v gives the multipliers of its rows; interior v have only the barrier's.
         rows = np.zeros(self.trajectories)
         rows[:n] = evidence - temperature
         parts = start.parts
@@ -408,27 +418,42 @@ class MinMaxProgram:
         result = solver(
             x0=_flat(v, pi, parts.T, start.values.T),
             lam_x0=_flat(
-                np.where(held, 0.0, -_WARM_BARRIER / v), start.proportion_multipliers,
-                start.part_multipliers.T, np.zeros_like(start.values.T),
+                np.where(held, 0.0, -_WARM_BARRIER / v),
+                start.proportion_multipliers,
+                start.part_multipliers.T,
+                np.zeros_like(start.values.T),
             ),
             lam_g0=_flat(rows, np.array([start.sum_multiplier]), start.bellman_multipliers.T),
-            p=_flat(*(part for table in padded for part in table), ~absent, [strength], [temperature], slack,
-            [ridge]), lbx=lower, ubx=upper, lbg=np.concatenate([np.where(loose, -np.inf, sums), bellman]),
+            p=_flat(
+                *(part for table in padded for part in table),
+                ~absent,
+                [strength],
+                [temperature],
+                slack,
+                [ridge],
+            ),
+            lbx=lower,
+            ubx=upper,
+            lbg=np.concatenate([np.where(loose, -np.inf, sums), bellman]),
             ubg=np.concatenate([np.where(loose, np.inf, sums), bellman]),
-        )  # fmt: skip
+        )
         outcome = solver.stats()
         status = "" if outcome["success"] else str(outcome["return_status"])
         x, bounds = (self._parted(np.asarray(result[name]).ravel()) for name in ("x", "lam_x"))
         constraints = np.asarray(result["lam_g"]).ravel()
         found = MinMaxPoint(
-            x[0], x[1], x[2], bounds[0], bounds[1],
+            x[0],
+            x[1],
+            x[2],
+            bounds[0],
+            bounds[1],
             constraints[self.trajectories + 1 :].reshape(n_components, n_states),
             float(constraints[self.trajectories]),
-        )  # fmt: skip
+        )
         return self._concluded(statistics, penalties, found, int(outcome["iter_count"]), not status), status
 
     def _parted(self, vector: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Proportions, parts of weights and values in a vector of variables or of their multipliers."""
+        """Split a vector of variables or multipliers into proportions, parts of weights, and values."""
         at = self.trajectories * self.components
         sizes = np.cumsum([at, self.components, 2 * self.mdp.n_features * self.components])
         _, pi, parts, values = np.split(vector, sizes)
@@ -456,9 +481,11 @@ class MinMaxProgram:
         pi = pi / pi.sum()
         posterior, evidence = _posterior(statistics, point.parts, values, pi, temperature)
         objective = (
-            evidence.sum() + temperature * strength * xlogy(pi, pi).sum()
-            - (np.abs(weights) @ slack).sum() - ridge / 2 * (weights**2).sum()
-        )  # fmt: skip
+            evidence.sum()
+            + temperature * strength * xlogy(pi, pi).sum()
+            - (np.abs(weights) @ slack).sum()
+            - ridge / 2 * (weights**2).sum()
+        )
         return MinMaxSolution(
             weights / self._scale, values, pi, posterior, float(objective), iterations, point
         )
@@ -471,7 +498,7 @@ def _posterior(
     proportions: np.ndarray,
     temperature: float,
 ) -> tuple[Float[np.ndarray, "n D"], Float[np.ndarray, " n"]]:
-    """The best responsibilities, and what each trajectory then adds to the objective."""
+    """Return the best responsibilities, and each trajectory's resulting share of the objective."""
     plus, minus = np.split(parts, 2, axis=1)
     likelihood = np.einsum("dik,dk->id", statistics.features, plus - minus)
     likelihood -= np.einsum("dis,ds->id", statistics.state_weights, values)
@@ -482,5 +509,5 @@ def _posterior(
 
 
 def _flat(*parts: Any) -> np.ndarray:
-    """Arrays as CasADi stacks them: column by column."""
+    """Stack arrays as CasADi does: column by column."""
     return np.concatenate([np.asarray(part, float).ravel(order="F") for part in parts])

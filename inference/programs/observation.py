@@ -1,19 +1,20 @@
 """The maximum-entropy observation program (chapter 6.1) in CasADi: reliabilities that explain agreement.
 
-Eq. 6.7 as printed asks one product to equal one number for every candidate truth; in general nothing does.
-What is solved here has a distribution as its answer: among all ``O(. | g)`` the one of greatest entropy,
-weighted by how likely each truth ``g`` is, whose expected agreement on each predicate is a target::
+Eq. 6.7 as printed asks one product to equal one number for every candidate truth, which is infeasible in
+general. The program here has a distribution as its solution: among all ``O(. | g)`` the one of greatest
+entropy, weighted by the probability of each truth ``g``, whose expected agreement on each predicate is a
+target::
 
     maximise    sum_g w(g) H(O(. | g))
     subject to  |sum_g w(g) sum_o O(o | g) [psi_j(o) = psi_j(g)] - target_j| <= slack_j
 
-Its answer is ``O(o | g) = exp(sum_j lambda_j [psi_j(o) = psi_j(g)]) / Z_g``: Eq. 6.5, normalised, with
-``lambda_j = logit p_j``, which is what :class:`~i2rl.models.FeatureNoise` says of reports.
+The solution is ``O(o | g) = exp(sum_j lambda_j [psi_j(o) = psi_j(g)]) / Z_g``: Eq. 6.5, normalised, with
+``lambda_j = logit p_j``, the model of :class:`~i2rl.models.FeatureNoise`.
 
-A report that came with a score is right or wrong as the score says
-(:mod:`~i2rl.inference.sensors.observations`). If it is wrong, it is one of the *other* pairs, ``O(o | g, o !=
-g)``, and these distributions, weighted by how likely each truth is among wrong reports, join the entropy and
-the expected agreement. Right ones have nothing to choose.
+A score says whether its observation is right or wrong (:mod:`~i2rl.inference.sensors.observations`). A wrong
+observation is one of the *other* pairs, ``O(o | g, o != g)``. These distributions, weighted by the
+probability of each truth among wrong observations, join the entropy and the expected agreement. Right ones
+have one outcome.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from ...models.observation.agreement import PredicateClasses, agreement_patterns
 from .constraints import ProgramNotSolved
 from .dual import COLD_OPTIONS, WARM_OPTIONS, IpoptPoint
 
-# The curvature along a direction that reports say nothing about is zero but for rounding.
+# In directions without information the curvature is zero up to rounding.
 _FLAT = 1e-10
 # exp of less than this is zero: a row of the program would lose all its terms.
 _LEAST_EXPONENT = 700.0
@@ -39,18 +40,18 @@ _LEAST_EXPONENT = 700.0
 
 @shown_briefly
 class Identification(NamedTuple):
-    """Which reliabilities reports can tell, whatever they are.
+    """Reliabilities that observations can identify, whatever their values.
 
     Fields
     ------
     uninformative : tuple of int
-        Predicates with one value on all that can be reported: their reliability changes no probability.
+        Predicates with one value on all reportable pairs: their reliability changes no probability.
     groups : tuple of tuples of int
-        Predicates of which only a combination is identified; of two that are equal (or opposite) everywhere,
+        Predicates of which only a combination is identified; for two that are equal (or opposite) everywhere,
         the product of the odds ``p / (1 - p)``.
     identified : float ``[J, J]``
-        Projection onto the identified directions of the logits. What it leaves unchanged can be learned;
-        two vectors of logits with one projection are one observation model at every truth of some weight.
+        Projection onto the identified directions of the logits. Its fixed vectors can be learned; two vectors
+        of logits with one projection are one observation model at every truth of positive weight.
     """
 
     uninformative: tuple[int, ...]
@@ -58,7 +59,7 @@ class Identification(NamedTuple):
     identified: Float[np.ndarray, "J J"]
 
     def describe(self, names: tuple[str, ...] | None = None) -> str:
-        """What cannot be told, in words; empty if everything can."""
+        """Describe the unidentified predicates in words; empty if all are identified."""
         called = (lambda j: f"predicate {j}") if names is None else (lambda j: names[j])
         lines = [
             f"{called(j)} is the same for everything that can be reported: uninformative"
@@ -68,15 +69,15 @@ class Identification(NamedTuple):
 
 
 class _Choices(NamedTuple):
-    """How many reports agree with a truth on what: all that the program knows of pairs.
+    """Number of observations that agree with a truth in each pattern: the program's view of pairs.
 
     Fields
     ------
     patterns : float ``[E, J]``
         Agreements and disagreements that occur.
     of_any, of_others : float ``[C, E]``
-        Number of pairs that agree so with a truth in each class: of all that can be reported, and of those
-        other than the truth, which can be reported itself.
+        Number of pairs with each pattern of agreement with a truth in each class: of all reportable pairs,
+        and of those other than the truth, which may be reportable itself.
     """
 
     patterns: Float[np.ndarray, "E J"]
@@ -95,7 +96,7 @@ def _choices(classes: PredicateClasses) -> _Choices:
 
 
 class _Truths(NamedTuple):
-    """Shares of truths whose report may be any pair, and of those whose report is another; of sum one."""
+    """Shares of truths with any observation, and of truths with another pair as observation; of sum one."""
 
     of_any: Float[np.ndarray, " C"]
     of_others: Float[np.ndarray, " C"]
@@ -104,13 +105,13 @@ class _Truths(NamedTuple):
 def _truths(
     classes: PredicateClasses, choices: _Choices, reportable: ArrayLike | None, weights: Any, wrong: Any
 ) -> _Truths:
-    """Check weights; raises ``ValueError`` as :meth:`ObservationProgram.solve` says."""
+    """Check weights; raise ``ValueError`` as :meth:`ObservationProgram.solve` does."""
     if wrong is None:
         return _Truths(classes.gather(weights), np.zeros(len(classes.vectors)))
     plain, wrong = classes.checked(weights, zero=True), classes.checked(wrong, zero=True)
     classes.checked(plain + wrong)
     itself = np.ones(wrong.shape, bool) if reportable is None else np.asarray(reportable, bool)
-    # A truth that cannot be reported is not left out of what can be.
+    # A truth that cannot be reported is not among the reportable pairs to leave out.
     total = plain.sum() + wrong.sum()
     of_any = classes.sum(plain + np.where(itself, 0, wrong)) / total
     of_others = classes.sum(np.where(itself, wrong, 0)) / total
@@ -128,11 +129,11 @@ def unidentified_predicates(
     reportable: ArrayLike | None = None,
     wrong: ArrayLike | None = None,
 ) -> Identification:
-    """Name the predicates ``[J, S, A]`` whose reliabilities no amount of reports would tell.
+    """Name the predicates ``[J, S, A]`` whose reliabilities no number of observations identifies.
 
-    ``weights [S, A]`` is how likely each truth is (equal by default), ``wrong [S, A]`` that among wrong
-    scored reports, as in :meth:`ObservationProgram.solve`: predicates that differ only where the truth never
-    is cannot be told apart. Raises ``ValueError`` for bad predicates and weights.
+    ``weights [S, A]`` are the probabilities of the truths (equal by default), ``wrong [S, A]`` those among
+    wrong scored observations, as in :meth:`ObservationProgram.solve`: predicates that differ only at
+    impossible truths are not identified. Raises ``ValueError`` for bad predicates and weights.
     """
     classes = predicate_classes(predicates, reportable)
     choices = _choices(classes)
@@ -142,9 +143,9 @@ def unidentified_predicates(
 
 
 def _identification(choices: _Choices, truths: _Truths) -> tuple[Identification, Float[np.ndarray, " J"]]:
-    """Identification, and the expected agreement of reports made at random.
+    """Return the identification, and the expected agreement of observations made at random.
 
-    The null space of the dual's curvature is the same at all logits; it is measured where they are zero.
+    The null space of the dual's curvature is the same at all logits; it is computed at zero logits.
     """
     mean, curvature = _moments(choices, truths, np.zeros(choices.patterns.shape[1]))
     sizes, axes = np.linalg.eigh(curvature)
@@ -172,7 +173,7 @@ def _mean_log_z(choices: _Choices, truths: _Truths, logits: Float[np.ndarray, " 
 def _moments(
     choices: _Choices, truths: _Truths, logits: Float[np.ndarray, " J"]
 ) -> tuple[Float[np.ndarray, " J"], Float[np.ndarray, "J J"]]:
-    """Expected agreement of reports, and its mean covariance given the truth."""
+    """Return the expected agreement of observations, and its mean covariance given the truth."""
     patterns = choices.patterns
     mean, covariance = np.zeros(len(logits)), np.zeros((len(logits),) * 2)
     for counts, share in ((choices.of_any, truths.of_any), (choices.of_others, truths.of_others)):
@@ -192,23 +193,23 @@ class ObservationSolution(NamedTuple):
     Fields
     ------
     reliabilities : float ``[J]``
-        ``p_j``; one half for uninformative predicates. Where only a combination is identified, the logits of
+        ``p_j``; one half for uninformative predicates. If only a combination is identified, the logits of
         least norm: equal ones for equal predicates.
     logits : float ``[J]``
         ``lambda_j = logit p_j``.
     agreement : float ``[J]``
-        Expected agreement of the solution, to be compared with the target.
+        Expected agreement of the solution, for comparison with the target.
     gap : float ``[J]``
-        How far the agreement lies outside ``target +- slack``: zero but for the solver's tolerance, unless
-        the target is beyond what logits within the limit can reach.
+        Distance of the agreement from ``target +- slack``: zero up to the solver's tolerance, unless the
+        target is beyond what logits within the limit can reach.
     entropy : float
-        ``sum_g w(g) H(O(. | g))``, and of wrong reports ``H(O(. | g, o != g))``, in nats.
+        ``sum_g w(g) H(O(. | g))``, plus ``H(O(. | g, o != g))`` of wrong observations, in nats.
     iterations : int
-        Of IPOPT.
+        IPOPT's iterations.
     warm : IpoptPoint
-        Where to start the next session from.
+        Start for the next session.
     identification : Identification
-        Which reliabilities the truths of this session can tell.
+        Reliabilities that the truths of this session identify.
     """
 
     reliabilities: Float[np.ndarray, " J"]
@@ -222,7 +223,7 @@ class ObservationSolution(NamedTuple):
 
 
 class ObservationProgram:
-    """The program's dual, convex in as many variables as there are predicates; built once, solved often.
+    """The program's dual, convex in one variable per predicate; built once, solved often.
 
     ::
 
@@ -230,20 +231,20 @@ class ObservationProgram:
                     - lambda.target + slack.(plus + minus),     lambda = plus - minus
         subject to  -limit <= lambda <= limit
 
-    ``Z'_g`` sums over the pairs other than ``g``, and ``v(g)`` is how likely ``g`` is among wrong reports.
-    Up to a factor it is minus the expected log-likelihood of the reports, if target and weights come from one
-    posterior over truths (:func:`~i2rl.models.observation.agreement.reported_matches`): maximum entropy is
-    maximum likelihood here, as everywhere in this package.
+    ``Z'_g`` sums over the pairs other than ``g``, and ``v(g)`` is the probability of ``g`` among wrong
+    observations. Up to a factor the objective is minus the expected log-likelihood of the observations, if
+    target and weights come from one posterior over truths
+    (:func:`~i2rl.models.observation.agreement.reported_matches`): maximum entropy is maximum likelihood.
 
     Parameters
     ----------
     predicates : bool or int ``[J, S, A]``
         Labels included, as in ``FeatureNoise``.
     reportable : bool ``[S, A]``, optional
-        Which pairs perception may report; all by default.
+        Pairs that perception may report; all by default.
     limit : float
         Largest logit. A target that no observation model meets, or only a noiseless one, then costs
-        ``limit`` nats per unit of agreement missed instead of having no solution; 12 is one error in 160 000.
+        ``limit`` nats per unit of agreement missed instead of being infeasible; 12 is one error in 160 000.
 
     Raises
     ------
@@ -264,12 +265,12 @@ class ObservationProgram:
         self.limit = float(limit)
         self._reportable = reportable
         self._choices = patterns, of_any, of_others = _choices(self.classes)
-        # Where there is no other pair there is no truth of any weight, but a logarithm.
+        # A truth without other pairs has weight zero, but needs a finite logarithm.
         of_others = np.where(of_others.any(1, keepdims=True), of_others, 1.0)
         plus, minus = ca.MX.sym("plus", n_predicates), ca.MX.sym("minus", n_predicates)
         truths, blamed = ca.MX.sym("w", n_classes), ca.MX.sym("v", n_classes)
         target, slack = ca.MX.sym("target", n_predicates), ca.MX.sym("slack", n_predicates)
-        # Relative to agreement where plus says so and disagreement where minus does, no exponent is positive.
+        # Relative to agreement for plus and to disagreement for minus, no exponent is positive.
         terms = ca.exp(-ca.DM(1 - patterns) @ plus - ca.DM(patterns) @ minus)
         log_z = ca.dot(truths, ca.log(ca.DM(of_any) @ terms)) + ca.dot(
             blamed, ca.log(ca.DM(of_others) @ terms)
@@ -295,25 +296,25 @@ class ObservationProgram:
         Parameters
         ----------
         weights : float ``[S, A]``
-            How likely each truth is; normalised here, together with ``wrong``.
+            Probability of each truth; normalised here, together with ``wrong``.
         target : float ``[J]``
-            Expected agreement on each predicate, in [0, 1]: matches of plain and of wrong reports, divided by
-            the number of both. Where predicates are not identified apart, what
-            contradicts (two numbers for equal predicates) is replaced by the nearest that does not.
+            Expected agreement on each predicate, in [0, 1]: matches of plain and of wrong observations,
+            divided by the number of both. For predicates that are not identified apart, contradictory
+            targets (two numbers for equal predicates) are replaced by the nearest consistent ones.
         slack : float or float ``[J]``
-            How far the agreement may lie from its target.
+            Largest distance of the agreement from its target.
         warm : IpoptPoint, optional
         wrong : float ``[S, A]``, optional
-            How likely each truth is among wrong reports with a score, on one scale with ``weights``. Either
-            may be all zero.
+            Probability of each truth among wrong observations with a score, on one scale with
+            ``weights``. Either may be all zero.
 
         Raises
         ------
         ValueError
-            For weights, targets and slacks of the wrong shape or range, and for wrong reports where only one
-            pair can be reported.
+            For weights, targets and slacks of the wrong shape or range, and for wrong observations with a
+            single reportable pair.
         ProgramNotSolved
-            When IPOPT gives up.
+            If IPOPT fails.
         """
         n_predicates = self.classes.vectors.shape[1]
         truths = _truths(self.classes, self._choices, self._reportable, weights, wrong)
@@ -353,8 +354,8 @@ class ObservationProgram:
         slack: Float[np.ndarray, " J"],
         warm: IpoptPoint | None,
     ) -> tuple[IpoptPoint, int, str]:
-        """A primal-dual point, its iterations, and a status that is empty if it solves the program."""
-        # Without slack, plus and minus could grow together for nothing: plus alone is then the logit.
+        """Return a primal-dual point, its iterations, and a status that is empty if the program is solved."""
+        # Without slack, plus and minus could grow together at no cost: plus alone is then the logit.
         free = slack == 0
         arguments: dict[str, Any] = {
             "p": np.concatenate([*truths, target, slack]),
@@ -379,7 +380,7 @@ def _in_unit_interval(what: str, numbers: np.ndarray, n_predicates: int) -> Floa
         raise ValueError(
             f"{n_predicates} predicates need as many {what}, got an array of shape {list(numbers.shape)}"
         )
-    # Expectations are sums, and sums round.
+    # Expectations are sums, which round.
     outside = ~((numbers >= -1e-9) & (numbers <= 1 + 1e-9))
     if outside.any():
         j = int(np.flatnonzero(outside)[0])

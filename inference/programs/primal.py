@@ -1,4 +1,4 @@
-"""The maximum-entropy program as it is written down, in CVXPY: the reward weights are dual values."""
+"""The maximum-entropy program in its primal form, in CVXPY: the reward weights are dual values."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ from .constraints import FeatureTarget, checked_problem, failure, flow_constrain
 from .maximum_entropy import soft_values
 
 _SETTINGS: dict[str, dict[str, object]] = {
-    # Clarabel aims at the first tolerances and, where rounding stops it earlier, calls a point within the
-    # reduced ones "almost solved", which still is as close as it could come: weights agree with the dual's to
-    # 1e-6. At 1e-10 they would to 1e-4.
+    # Clarabel aims at the first tolerances. If rounding stops it earlier, it calls a point within the reduced
+    # ones "almost solved", as close as it could come: weights agree with the dual's to 1e-6, with tolerances
+    # of 1e-10 only to 1e-4.
     "CLARABEL": {
         "tol_gap_abs": 1e-12,
         "tol_gap_rel": 1e-12,
@@ -51,9 +51,9 @@ class PrimalSolution(NamedTuple):
     occupancy : float ``[S, A]``
         The optimal discounted occupancy; it sums to ``1 / (1 - gamma)``.
     iterations : int
-        Of the solver.
+        The solver's iterations.
     converged : bool
-        Whether the solver met its tolerances; what is returned to a caller has.
+        True if the solver met its tolerances; solutions returned to a caller have.
     """
 
     weights: Float[np.ndarray, " K"]
@@ -112,8 +112,8 @@ class PrimalProgram:
         """Solve for a target.
 
         ``slack`` (a number or ``[K]``) is ``beta``, in units of each feature's scale. Raises
-        ``InfeasibleProgram`` naming the features that no policy can match, ``ProgramNotSolved`` when the
-        solver gives up, and ``ValueError`` for a malformed target.
+        ``InfeasibleProgram`` naming the features that no policy can match, ``ProgramNotSolved`` if the solver
+        fails, and ``ValueError`` for a malformed target.
         """
         features, start, beta = checked_problem(self.mdp, target, slack)
         program = self._program(reachable_states(self.mdp, start))
@@ -154,7 +154,7 @@ def _compile(mdp: TabularMDP, reachable: np.ndarray) -> _Compiled:
     phi_hat = cp.Parameter(k, name="phi_hat")
     p0 = cp.Parameter(len(flow.states), nonneg=True, name="p0")
     beta = cp.Parameter(k, nonneg=True, name="beta")
-    # A state without a choice adds no entropy, and its cones would only be in the way.
+    # A state with one action adds no entropy, and its cones would only cost time.
     choice = np.flatnonzero((np.bincount(flow.row) > 1)[flow.row])
     same_state = (flow.row[choice, None] == flow.row[None, :]).astype(float)
     entropy = -cp.sum(cp.rel_entr(x[choice], same_state @ x)) if len(choice) else 0 * cp.sum(x)

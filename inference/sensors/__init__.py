@@ -1,4 +1,4 @@
-"""The M-step of a sensor: what a session's observations say of its reliabilities and confusions.
+"""The M-step of a sensor: its reliabilities and confusions given a session's observations.
 
 Imports the rooms of programs, sessions and completion.
 """

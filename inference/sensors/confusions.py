@@ -17,26 +17,26 @@ class ConfusionNoise(Protocol):
 
     @property
     def chances(self) -> Float[Array, " M"]:
-        """Probability of each, where it acts."""
+        """Probability of each confusion, where it acts."""
 
     @property
     def acts(self) -> Bool[Array, "M S A"]:
-        """Where each has something to confuse."""
+        """Marks of the pairs on which each confusion acts."""
 
     @property
     def noise(self) -> ObservationModel:
         """The observation model."""
 
     def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
-        """Which of them turned each truth into its report (flat indices)."""
+        """Mark the confusion that turned each truth into its observation (flat indices)."""
 
     def _replace(self, *, chances: Array = ...) -> Any:
-        """Itself with other ``chances``."""
+        """Replace the ``chances``."""
 
 
 @shown_briefly
 class ConfusionStatistic(NamedTuple):
-    """Expected numbers ``[M]``: how often each confusion happened, and how often it could have."""
+    """Expected numbers ``[M]`` of each confusion: occurrences, and opportunities."""
 
     happened: Float[Array, " M"]
     possible: Float[Array, " M"]
@@ -45,9 +45,9 @@ class ConfusionStatistic(NamedTuple):
 def confusion_counts(
     noise: ConfusionNoise, pairs: Float[Array, "n L S A"], demonstration: Demonstration
 ) -> ConfusionStatistic:
-    """The E-step: confusions counted over the posterior ``pairs`` of the truth.
+    """Run the E-step: count confusions over the posterior ``pairs`` of the truth.
 
-    Steps that were seen in part, or not at all, say nothing.
+    Partly or fully hidden steps do not count.
     """
     kind, state, action = (jnp.asarray(x) for x in demonstration.arrays[:3])
     seen = (kind == SEEN) & (state != UNKNOWN) & (action != UNKNOWN)
@@ -65,5 +65,5 @@ def confusion_counts(
 def fitted_confusions(
     assumed: ConfusionNoise, counts: ConfusionStatistic, trust: float
 ) -> Float[Array, " M"]:
-    """The M-step: shares of what happened, the assumed probabilities counting as ``trust`` observations."""
+    """Run the M-step: shares of occurrences, with the assumed probabilities as ``trust`` observations."""
     return (trust * assumed.chances + counts.happened) / (trust + counts.possible)

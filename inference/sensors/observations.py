@@ -1,13 +1,13 @@
-"""What perception reports of a session, as evidence about the truth, and what a posterior says of perception.
+"""A session's observations as evidence about the truth, and statistics of perception under a posterior.
 
-Everything is in *classes* of pairs that no predicate tells apart, and Eq. 6.5 in the patterns of agreement of
-two classes. A report that names a pair costs a number for each class of truths; one that leaves the state or
-the action open is the set of pairs it could be, and costs the whole table ``[C, C]`` of Eq. 6.5.
+All quantities are in *classes* of pairs with equal predicates, and Eq. 6.5 in the patterns of agreement of
+two classes. An observation of a pair costs one number for each class of truths; one with a hidden state or
+action is a set of possible pairs, and costs the whole table ``[C, C]`` of Eq. 6.5.
 
-A score ``c`` is the perception's probability that its report is right. A scored report follows
+A score ``c`` is perception's probability that its observation is right. A scored observation follows
 ``c [o = g] + (1 - c) O(o | g, o != g)``, where ``O(o | g, o != g)`` is Eq. 6.5 among the *other* pairs: the
-distribution of greatest entropy that has this probability of being right and the expected agreement
-asked for. An unscored report follows ``O(o | g)`` itself. Both share one set of reliabilities.
+distribution of greatest entropy with this probability of being right and the required expected agreement. An
+unscored observation follows ``O(o | g)`` itself. Both share one set of reliabilities.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ from ...models.observation.demonstration import HIDDEN, SEEN, UNKNOWN, Demonstra
 from ...models.observation.evidence import FeatureNoise
 from ..programs.maximum_entropy import quadratic_l1
 
-# A perception that is certain may still be wrong: a score of one would rule out every other truth, and one of
-# zero the truth that was reported.
+# Certain perception may still be wrong: a score of one would exclude every other truth, and a score of zero
+# the observed one.
 CERTAIN = 0.999
-# A logit of more is one error in 160 000.
+# A larger logit is one error in 160 000.
 LIMIT = 12.0
 
 _MAX_STEPS = 30
@@ -45,11 +45,11 @@ class ReportClasses(NamedTuple):
     Fields
     ------
     patterns : float ``[E, J]``
-        On which predicates a truth and a report may agree; what does not occur is left out.
+        Possible patterns of agreement of a truth and an observation on the predicates.
     pattern : int ``[C, C]``
-        Which of them two classes have; symmetric.
+        Pattern of two classes; symmetric.
     choices : float ``[C, E]``
-        Number of pairs that can be reported and agree so with a truth.
+        Number of reportable pairs with each pattern of agreement with a truth.
     reportable : float ``[C]``
         Number of pairs of each class that perception may report: all of a class, or none.
     of_pair : int ``[S, A]``
@@ -65,7 +65,7 @@ class ReportClasses(NamedTuple):
 
     @property
     def wrong_choices(self) -> Float[Array, "C E"]:
-        """As ``choices``, of the pairs other than the truth."""
+        """``choices`` without the truth itself."""
         return self.choices - (self.reportable > 0)[:, None] * self.itself
 
     @property
@@ -75,18 +75,18 @@ class ReportClasses(NamedTuple):
 
     @property
     def certain(self) -> Float[Array, "S A"]:
-        """Whether a scored report is right, one or zero, where it could not be otherwise; else NaN."""
+        """One or zero for truths at which every scored observation must be right or wrong; else NaN."""
         alone = self.can_be_reported & (jnp.sum(self.reportable) == 1)
         return jnp.where(self.can_be_reported, jnp.where(alone, 1.0, jnp.nan), 0.0)
 
     def gather(self, pairs: Float[Array, "*n S A"]) -> Float[Array, "*n C"]:
-        """Sums over the pairs of each class."""
+        """Sum over the pairs of each class."""
         last = jnp.moveaxis(pairs.reshape(*pairs.shape[:-2], -1), -1, 0)
         return jnp.moveaxis(jax.ops.segment_sum(last, self.of_pair.ravel(), len(self.reportable)), 0, -1)
 
 
 def report_classes(predicates: ArrayLike, reportable: ArrayLike | None = None) -> ReportClasses:
-    """Gather the pairs ``[S, A]``; arguments and errors as of :class:`~i2rl.models.FeatureNoise`."""
+    """Gather the pairs ``[S, A]``; arguments and errors as for :class:`~i2rl.models.FeatureNoise`."""
     psi, mask = np.asarray(predicates), None if reportable is None else np.asarray(reportable)
     noise = FeatureNoise(psi, np.full(psi.shape[:1], 0.5), mask)
     psi, mask = np.asarray(noise.predicates), np.asarray(noise.reportable)
@@ -110,17 +110,17 @@ def report_classes(predicates: ArrayLike, reportable: ArrayLike | None = None) -
 
 @shown_briefly
 class SessionReports(NamedTuple):
-    """A session's reports, prepared for any reliabilities.
+    """A session's observations, prepared for any reliabilities.
 
     Fields
     ------
     kind : int ``[n, L]``
     said : float ``[n, L, C]``
-        How many pairs of each class the report could be.
+        Number of pairs of each class that the observation may be.
     same : bool ``[n, L, S, A]``
-        Which pairs it could be.
+        Pairs that the observation may be.
     score : float ``[n, L]``
-        NaN for none.
+        NaN without a score.
     """
 
     kind: Int[Array, "n L"]
@@ -130,24 +130,24 @@ class SessionReports(NamedTuple):
 
     @property
     def seen(self) -> Bool[Array, "n L"]:
-        """Which steps were reported."""
+        """Marks of the observed steps."""
         return self.kind == SEEN
 
     @property
     def whole(self) -> Bool[Array, "n L"]:
-        """Which reports name one pair."""
+        """Marks of the observations that name one pair."""
         return self.seen & (jnp.sum(self.said, axis=2) == 1)
 
     @property
     def open(self) -> Bool[Array, ""]:
-        """Whether any of the reports could be of more than one pair."""
+        """True if any observation may be of more than one pair."""
         return jnp.any(jnp.sum(self.said, axis=2) > 1)
 
 
 def session_reports(
     classes: ReportClasses, demonstration: Demonstration, scored: bool = True
 ) -> SessionReports:
-    """Prepare a demonstration; with ``scored`` false its scores are left aside."""
+    """Prepare a demonstration; ``scored`` false ignores its scores."""
     kind, state, action, score = (jnp.asarray(x) for x in demonstration.arrays)
     n_states, n_actions = classes.of_pair.shape
     states = (state[..., None] == UNKNOWN) | (state[..., None] == jnp.arange(n_states))
@@ -155,7 +155,7 @@ def session_reports(
     seen = kind == SEEN
     same = states[..., :, None] & actions[..., None, :] & classes.can_be_reported & seen[..., None, None]
     said = classes.gather(same.astype(float))
-    # Beyond certainty nothing is gained, and nothing could be unlearned.
+    # A score of one gains nothing, and could not be corrected.
     score = jnp.where(seen & scored, jnp.clip(score, 1 - CERTAIN, CERTAIN), jnp.nan)
     return SessionReports(kind, said, same, score)
 
@@ -170,12 +170,12 @@ class _Terms(NamedTuple):
     ------
     by_pattern : float ``[E]``
     total, others : float ``[C]``
-        By the class of the truth: sums over all that can be reported, and over all but the truth; one where
-        there is nothing.
+        By the class of the truth: sums over all reportable pairs, and over all but the truth; one for an
+        empty sum.
     possible : bool ``[C]``
-        Whether anything but the truth can be reported.
+        True if a pair other than the truth can be reported.
     itself : float
-        Of the truth itself.
+        The factor of the truth itself.
     """
 
     by_pattern: Float[Array, " E"]
@@ -186,7 +186,7 @@ class _Terms(NamedTuple):
 
 
 def _terms(classes: ReportClasses, logits: Float[Array, " J"]) -> _Terms:
-    """Of reliabilities ``p_j`` with these logits."""
+    """Evaluate Eq. 6.5 for reliabilities ``p_j`` with these logits."""
     exponents = classes.patterns @ logits
     terms = jnp.exp(exponents - exponents.max())
     others = classes.wrong_choices @ terms
@@ -202,7 +202,7 @@ def _terms(classes: ReportClasses, logits: Float[Array, " J"]) -> _Terms:
 def _reported(
     classes: ReportClasses, reports: SessionReports, by_pattern: Float[Array, " E"]
 ) -> Float[Array, "n L C"]:
-    """``sum_o said_o f(agreement of g and o)`` of every step, for truths ``g`` in each class."""
+    """Compute ``sum_o said_o f(agreement of g and o)`` of every step, for truths ``g`` in each class."""
 
     def named() -> Array:
         at = classes.pattern[jnp.argmax(reports.said, axis=2)]
@@ -214,7 +214,7 @@ def _reported(
 def _by_pattern(
     classes: ReportClasses, reports: SessionReports, weights: Float[Array, "n L C"]
 ) -> Float[Array, " E"]:
-    """What weights of truths amount to for each pattern: the transpose of :func:`_reported`."""
+    """Sum weights of truths over each pattern: the transpose of :func:`_reported`."""
     zero = jnp.zeros(len(classes.patterns))
 
     def named() -> Array:
@@ -228,7 +228,7 @@ def _by_pattern(
 
 
 class _Likelihood(NamedTuple):
-    """``P(report | g)`` of every step, and its parts: ``right + wrong`` where scored, else ``plain``."""
+    """``P(report | g)`` of every step, and its parts: ``right + wrong`` if scored, else ``plain``."""
 
     plain: Float[Array, "n L C"]
     right: Float[Array, "n L S A"]
@@ -241,7 +241,7 @@ class _Likelihood(NamedTuple):
 def _likelihood(
     classes: ReportClasses, terms: _Terms, reports: SessionReports, confidence: Float[Array, "... S A"]
 ) -> _Likelihood:
-    """Of every step and truth; ``confidence`` that a report is right given the truth, NaN for none."""
+    """Evaluate every step and truth; ``confidence`` is that of an observation, NaN without scores."""
     scored = jnp.broadcast_to(~jnp.isnan(confidence), reports.same.shape)
     c = jnp.where(jnp.isnan(classes.certain), jnp.where(scored, confidence, 0.0), classes.certain)
     reported = _reported(classes, reports, terms.by_pattern)
@@ -261,16 +261,16 @@ def report_log_evidence(
     confidence: Float[Array, "... S A"],
     visibility: Float[Array, " S"] | None = None,
 ) -> Float[Array, "n L S A"]:
-    """``log e_t(s, a)`` of every step under these reliabilities.
+    """Return ``log e_t(s, a)`` of every step under these reliabilities.
 
     Parameters
     ----------
     classes, logits, reports
     confidence : float ``[S, A]`` or ``[n, L, S, A]``
-        Probability that the report is right if the truth is ``(s, a)``; NaN where there are no scores. Of a
-        truth that cannot be reported no report is right, whatever is said here.
+        Probability that the observation is right if the truth is ``(s, a)``; NaN without scores. For a truth
+        that cannot be reported it is zero, whatever the argument.
     visibility : float ``[S]``, optional
-        Probability of being in view; everything is, by default.
+        Probability of being in view; one by default.
     """
     total = _likelihood(classes, _terms(classes, logits), reports, confidence).total
     noise = jnp.where(total > 0, jnp.log(jnp.where(total > 0, total, 1.0)), -jnp.inf)
@@ -285,22 +285,22 @@ def report_log_evidence(
 
 @shown_briefly
 class ReportStatistic(NamedTuple):
-    """All that is kept of reports: running averages over them.
+    """Statistic of observations: running averages over them.
 
     Fields
     ------
     size : float
-        Number of reports.
+        Number of observations.
     plain : float ``[C]``
-        Share of unscored reports by class of their truth, under the posterior of their session.
+        Share of unscored observations by class of their truth, under the posterior of their session.
     wrong : float ``[C]``
-        Share of scored reports that are wrong, likewise.
+        Share of wrong scored observations by class of their truth.
     right : float
-        Share of scored reports that are right.
+        Share of right scored observations.
     matches : float ``[J]``
-        Share of unscored and of wrong reports that agree with their truth on each predicate.
+        Share of unscored and of wrong observations that agree with their truth on each predicate.
     scores, scored : float ``[S, A]``
-        Per report: sum of the scores of each reported pair, and their number (Eq. 6.6 is their ratio).
+        Per observation: sum of the scores of each observed pair, and their number (Eq. 6.6 is their ratio).
     """
 
     size: Float[Array, ""]
@@ -313,25 +313,25 @@ class ReportStatistic(NamedTuple):
 
     @property
     def confidence(self) -> Float[Array, "S A"]:
-        """``O_hat(o)`` of Eq. 6.6; NaN for pairs never reported with a score."""
+        """``O_hat(o)`` of Eq. 6.6; NaN for pairs never observed with a score."""
         some = self.scored > 0
         return jnp.where(some, self.scores / jnp.where(some, self.scored, 1.0), jnp.nan)
 
     @property
     def agreement(self) -> Float[Array, " J"]:
-        """Expected share of reports that agree with their truth on each predicate; NaN before any report."""
+        """Expected share of observations that agree with their truth on each predicate; NaN before any."""
         return _share(self, self.matches)
 
 
 def no_reports(classes: ReportClasses) -> ReportStatistic:
-    """The statistic before the first report."""
+    """Return the statistic before the first observation."""
     zero, by_class = jnp.zeros(()), jnp.zeros(len(classes.reportable))
     matches, pairs = jnp.zeros(classes.patterns.shape[1]), jnp.zeros(classes.of_pair.shape)
     return ReportStatistic(zero, by_class, by_class, zero, matches, pairs, pairs)
 
 
 def score_statistic(reports: SessionReports) -> tuple[Float[Array, "S A"], Float[Array, "S A"]]:
-    """Sum and number of scores by reported pair; reports that leave something open have no part in it."""
+    """Return sum and number of scores by observed pair; observations with hidden coordinates are left out."""
     counts = reports.whole & ~jnp.isnan(reports.score)
     weight = jnp.where(counts, reports.score, 0.0)
     return jnp.einsum("nl,nlsa->sa", weight, reports.same.astype(float)), jnp.einsum(
@@ -346,7 +346,7 @@ def report_statistic(
     confidence: Float[Array, "... S A"],
     pairs: Float[Array, "n L S A"],
 ) -> ReportStatistic:
-    """What a posterior over truths ``pairs`` says of a session's reports."""
+    """Summarise a session's observations under a posterior ``pairs`` over truths."""
     terms = _terms(classes, logits)
     parts = _likelihood(classes, terms, reports, confidence)
     mass = pairs * reports.seen[..., None, None]
@@ -354,7 +354,7 @@ def report_statistic(
     possible = parts.scored & (parts.total > 0)
     share = jnp.where(possible, mass / jnp.where(possible, parts.total, 1.0), 0.0)
     wrong = classes.gather(jnp.sum(share * parts.wrong, axis=(0, 1)))
-    # Wrong reports, as if the report could be anything it says, less the truth itself.
+    # Wrong observations: all pairs that the observation may be, less the truth itself.
     blame = share * (1 - parts.confidence) * (terms.possible / terms.others)[classes.of_pair]
     rate = plain / jnp.where(parts.plain > 0, parts.plain * terms.total, 1.0)
     agreed = _by_pattern(classes, reports, rate + classes.gather(blame))
@@ -378,13 +378,13 @@ def report_statistic(
 
 @shown_briefly
 class SensorFit(NamedTuple):
-    """Reliabilities that explain the statistic.
+    """Reliabilities fitted to the statistic.
 
     Fields
     ------
     logits : float ``[J]``
     agreement : float ``[J]``
-        Expected agreement of reports with their truths: the statistic's, to within the slack.
+        Expected agreement of observations with their truths: the statistic's, to within the slack.
     iterations : int
     """
 
@@ -396,14 +396,14 @@ class SensorFit(NamedTuple):
 def _moments(
     classes: ReportClasses, statistic: ReportStatistic, logits: Float[Array, " J"]
 ) -> tuple[Float[Array, ""], Float[Array, " J"], Float[Array, "J J"]]:
-    """``sum_g plain_g log Z_g + sum_g wrong_g log Z'_g``, its gradient (agreement) and its curvature."""
+    """Return ``sum_g plain_g log Z_g + sum_g wrong_g log Z'_g``, its gradient (agreement) and curvature."""
     exponents = classes.patterns @ logits
     highest = exponents.max()
     terms = jnp.exp(exponents - highest)
     value, mean = jnp.zeros(()), jnp.zeros(len(logits))
     curvature = jnp.zeros((len(logits), len(logits)))
     for truths, choices in ((statistic.plain, classes.choices), (statistic.wrong, classes.wrong_choices)):
-        # A truth with nothing to choose from has no weight.
+        # A truth without alternatives has no weight.
         total = choices @ terms
         weight, total = jnp.where(total > 0, truths, 0.0), jnp.where(total > 0, total, 1.0)
         share = choices * terms / total[:, None]
@@ -423,10 +423,8 @@ def _quadratic_in_box(
 ) -> Float[Array, " J"]:
     """Solve :func:`~i2rl.inference.programs.maximum_entropy.quadratic_l1` for weights within ``LIMIT``.
 
-    ``origin`` is there.
-
-    What is held at a limit is guessed and the others solved for; a sweep of coordinate descent corrects the
-    guess.
+    ``origin`` is within it. Weights at a limit are guessed and the others solved for; coordinate descent
+    corrects the guess.
     """
     damping = 1e-8 * jnp.max(jnp.diag(curvature)) + 1e-200
     damped = curvature + damping * jnp.eye(len(slope))
@@ -463,7 +461,7 @@ def _quadratic_in_box(
 
 
 def _residual(gradient: Array, slack: Array, logits: Array) -> Array:
-    """Zero where no step within the limits would help."""
+    """Return zero if no step within the limits would help."""
     step = logits - gradient
     step = jnp.sign(step) * jnp.maximum(jnp.abs(step) - slack, 0.0)
     return jnp.max(jnp.abs(jnp.clip(step, -LIMIT, LIMIT) - logits))
@@ -478,12 +476,14 @@ def fit_sensor(
     start: Float[Array, " J"],
     tolerance: float = 1e-8,
 ) -> SensorFit:
-    """Solve the observation program's dual (proximal Newton): the program of
-    :class:`~i2rl.inference.programs.observation.ObservationProgram`, traceable by JAX.
+    """Solve the observation program's dual by proximal Newton, traceable by JAX.
 
-    Minimises ``sum_g plain_g log Z_g + sum_g wrong_g log Z'_g - logits.matches + slack |logits|`` with ``Z'``
-    over the pairs other than the truth. ``slack`` is how far the expected agreement may be from the
-    statistic's; one error in a hundred reports is a slack of 0.01. Logits stay within ``LIMIT``.
+    The program is that of :class:`~i2rl.inference.programs.observation.ObservationProgram`.
+
+    It minimises ``sum_g plain_g log Z_g + sum_g wrong_g log Z'_g - logits.matches + slack |logits|`` with
+    ``Z'`` over the pairs other than the truth. ``slack`` is the largest distance of the expected agreement
+    from the statistic's; one error in a hundred observations is a slack of 0.01. Logits stay within
+    ``LIMIT``.
     """
     matches = statistic.matches
     beta = jnp.broadcast_to(jnp.asarray(slack, float), matches.shape)
@@ -526,11 +526,11 @@ def fit_sensor(
 def agreement_of(
     classes: ReportClasses, logits: Float[Array, " J"], statistic: ReportStatistic
 ) -> Float[Array, " J"]:
-    """Expected agreement ``[J]`` of reports with truths that occurred as the statistic says."""
+    """Return expected agreement ``[J]`` of observations with truths distributed as in the statistic."""
     return _share(statistic, _moments(classes, statistic, logits)[1])
 
 
 def _share(statistic: ReportStatistic, mean: Float[Array, " J"]) -> Float[Array, " J"]:
-    """Agreement per report, given that of plain and wrong ones; NaN before any report."""
+    """Return the agreement per observation, given that of plain and wrong ones; NaN before any."""
     total = jnp.sum(statistic.plain) + jnp.sum(statistic.wrong) + statistic.right
     return (mean + statistic.right) / jnp.where(statistic.size > 0, total, jnp.nan)

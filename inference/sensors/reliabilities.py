@@ -1,7 +1,7 @@
-"""Ways of learning what perception is worth: from a posterior over truths, or by counting (section 6.1).
+"""Methods of learning reliabilities: from a posterior over truths, or by counting (section 6.1).
 
-Each says how a session's reports are summarised, how summaries are merged, and which reliabilities follow;
-:mod:`~i2rl.inference.learners.noisy` does the rest alike for all.
+Each method summarises a session's observations, merges summaries, and fits reliabilities;
+:mod:`~i2rl.inference.learners.noisy` is the same for all.
 """
 
 from __future__ import annotations
@@ -33,45 +33,45 @@ from .observations import (
     session_reports,
 )
 
-# Counts of the released program's frequencies before the first report.
+# Counts of the released program's frequencies before the first observation.
 _CODED_COUNT = 1e-4
-# Of reliabilities that are frequencies: one error in a million, so that their logits are finite.
+# Bound of reliabilities that are frequencies: one error in a million, so that their logits are finite.
 _SURE = 1e-6
 
 
 @shown_briefly
 class WithTruth(NamedTuple):
-    """A noisy demonstration and what really happened, for the ``oracle`` only; arrays of one shape."""
+    """A noisy demonstration and its truth, for the ``oracle`` only; arrays of one shape."""
 
     seen: Demonstration
     truth: Demonstration
 
     @property
     def kind(self) -> Any:
-        """That of what was seen."""
+        """Kind of the observed steps."""
         return self.seen.kind
 
     @property
     def lengths(self) -> Int[np.ndarray, " n"]:
-        """Of what was seen."""
+        """Lengths of the observed trajectories."""
         return self.seen.lengths
 
     def bucketed(self) -> WithTruth:
-        """Both padded alike."""
+        """Pad both to one shape."""
         return WithTruth(self.seen.bucketed(), self.truth.bucketed())
 
 
 @shown_briefly
 class PreparedSession(NamedTuple):
-    """A session's demonstration in the form that passes over it need.
+    """A session's demonstration, prepared for passes over it.
 
     Fields
     ------
     reports : SessionReports
     live : bool ``[n, L]``
-        Which steps exist.
+        Marks of existing steps.
     truth : float ``[n, L, S, A]`` or None
-        A point at what happened, where it is known.
+        A point at the true pair, if it is known.
     """
 
     reports: SessionReports
@@ -82,7 +82,7 @@ class PreparedSession(NamedTuple):
 def prepare(
     mdp: TabularMDP, classes: ReportClasses, demonstration: Demonstration | WithTruth, scored: bool
 ) -> PreparedSession:
-    """Prepare a demonstration; its scores are left aside unless ``scored``."""
+    """Prepare a demonstration; ``scored`` false ignores its scores."""
     seen, truth = demonstration, None
     if isinstance(demonstration, WithTruth):
         seen = demonstration.seen
@@ -100,28 +100,28 @@ def prepare(
 
 @shown_briefly
 class Perception(NamedTuple):
-    """How reliabilities are learned.
+    """Method of learning reliabilities.
 
     Fields
     ------
     classes : ReportClasses
     scored : bool
-        Whether scores are used.
+        True if scores are used.
     empty : NamedTuple
         The statistic before the first session.
     blend : ``(kept, new) -> statistic``
     summarise : ``(logits, session, confidence, pairs) -> statistic``
-        Of one session, ``pairs [n, L, S, A]`` being the posterior over truths.
+        Summary of one session, ``pairs [n, L, S, A]`` being the posterior over truths.
     fit : ``(statistic, logits) -> logits [J]``
-        Started at the present ones.
+        Start: the current logits.
     agreement : ``(logits, statistic) -> [J]``
-        How often a predicate of a report is that of the truth, by what was learned.
+        Learned frequency with which an observation's predicate is that of the truth.
     confidence : ``(kept, reports) -> [S, A] or [n, L, S, A]``
-        That a report of each pair is right; NaN without scores.
+        Probability that an observation of each pair is right; NaN without scores.
     fit_outside : ``(statistic, warm) -> (logits, warm)``, or None
         The same fit by a solver outside JAX.
     hear : ``(kept, demonstration) -> statistic``, or None
-        For what must be computed outside JAX, before the session begins.
+        Computation outside JAX, before the session begins.
     """
 
     classes: ReportClasses
@@ -147,7 +147,7 @@ def entropic_perception(
     forgetting: float,
     program: ObservationProgram | None = None,
 ) -> Perception:
-    """The observation program, fed by a posterior over truths, by reports taken for truths, or by truths."""
+    """Build the observation program with a posterior over truths, observations at face value, or truths."""
 
     def summarise(
         logits: Array, session: PreparedSession, confidence: Array, pairs: Array
@@ -165,7 +165,7 @@ def entropic_perception(
 
     def fit(statistic: ReportStatistic, logits: Array) -> Array:
         fitted = fit_sensor(classes, statistic, slack(statistic), logits).logits
-        # Where nothing was reported yet, slack alone would turn what was assumed into ignorance.
+        # Before any observation, slack alone would turn the assumed reliabilities into one half.
         return jnp.where(statistic.size > 0, fitted, logits)
 
     def fit_outside(statistic: ReportStatistic, warm: IpoptPoint) -> tuple[Array, IpoptPoint]:
@@ -174,12 +174,15 @@ def entropic_perception(
         sizes = np.bincount(of_pair.ravel(), minlength=len(classes.reportable))
         plain, wrong = ((np.asarray(x) / sizes)[of_pair] for x in (statistic.plain, statistic.wrong))
         total = plain.sum() + wrong.sum()
-        if total <= 0:  # every report is scored and right: nothing is said of errors
+        if total <= 0:  # every observation is scored and right, and carries no information on errors
             return jnp.zeros(classes.patterns.shape[1]), warm
         solution = program.solve(
-            plain, np.asarray(statistic.matches) / total, min(float(slack(statistic)) / total, 1.0),
-            warm if np.size(warm.variables) else None, wrong=wrong,
-        )  # fmt: skip
+            plain,
+            np.asarray(statistic.matches) / total,
+            min(float(slack(statistic)) / total, 1.0),
+            warm if np.size(warm.variables) else None,
+            wrong=wrong,
+        )
         return jnp.asarray(solution.logits), solution.warm
 
     def confidence(kept: ReportStatistic, reports: SessionReports) -> Array:
@@ -192,9 +195,16 @@ def entropic_perception(
         return jnp.where(number > 0, total / jnp.where(number > 0, number, 1.0), jnp.nan)
 
     return Perception(
-        classes, scores != "none", no_reports(classes), partial(blend, forgetting=forgetting), summarise, fit,
-        partial(agreement_of, classes), confidence, None if program is None else fit_outside,
-    )  # fmt: skip
+        classes,
+        scores != "none",
+        no_reports(classes),
+        partial(blend, forgetting=forgetting),
+        summarise,
+        fit,
+        partial(agreement_of, classes),
+        confidence,
+        None if program is None else fit_outside,
+    )
 
 
 # -- controls -----------------------------------------------------------------------------------------
@@ -207,9 +217,9 @@ class FrequencyStatistic(NamedTuple):
     Fields
     ------
     size : float
-        Of what is averaged: reports, or sessions.
+        Number of averaged items: observations, or sessions.
     share : float ``[J]``
-        Running average of what each predicate is credited with.
+        Running average of each predicate's credit.
     """
 
     size: Float[Array, ""]
@@ -221,7 +231,7 @@ def _no_confidence(kept: FrequencyStatistic, reports: SessionReports) -> Array:
 
 
 def counted_perception(classes: ReportClasses, predicates: Bool[np.ndarray, "J S A"]) -> Perception:
-    """RIFOM's frequencies in a fair form: every report is taken for the truth as far as its score goes.
+    """Build RIFOM's frequencies in a fair form: every observation counts as the truth by its score.
 
     ``p_j = (sum_t c_t + 1) / (T + 2)`` over all steps, a missing score counting as one.
     """
@@ -239,17 +249,23 @@ def counted_perception(classes: ReportClasses, predicates: Bool[np.ndarray, "J S
         return (statistic.share * statistic.size + 1) / (statistic.size + 2)
 
     return Perception(
-        classes, True, FrequencyStatistic(jnp.zeros(()), jnp.zeros(n_predicates)), blend, summarise,
-        lambda statistic, logits: _logit(agreement(logits, statistic)), agreement, _no_confidence,
-    )  # fmt: skip
+        classes,
+        True,
+        FrequencyStatistic(jnp.zeros(()), jnp.zeros(n_predicates)),
+        blend,
+        summarise,
+        lambda statistic, logits: _logit(agreement(logits, statistic)),
+        agreement,
+        _no_confidence,
+    )
 
 
 def coded_perception(classes: ReportClasses, predicates: Bool[np.ndarray, "J S A"]) -> Perception:
-    """RIFOM's frequencies as the released program counts them, for comparison.
+    """Build RIFOM's frequencies as the released program counts them, for comparison.
 
-    Of each trajectory only the last report is looked at, a predicate is credited when it is true of it, and
-    credits are normalised over all predicates and their negations; sessions are averaged. With this, what is
-    reliable and always false is thought unreliable.
+    Only the last observation of each trajectory counts, a predicate is credited if it is true there, and
+    credits are normalised over all predicates and their negations; sessions are averaged. A predicate that is
+    reliable and always false therefore appears unreliable.
     """
     psi = jnp.asarray(np.asarray(predicates, float))
 
@@ -267,15 +283,21 @@ def coded_perception(classes: ReportClasses, predicates: Bool[np.ndarray, "J S A
         return statistic.share
 
     return Perception(
-        classes, False, FrequencyStatistic(jnp.zeros(()), jnp.full(len(psi), 0.5)), blend, summarise,
-        lambda statistic, logits: _logit(statistic.share), agreement, _no_confidence,
-    )  # fmt: skip
+        classes,
+        False,
+        FrequencyStatistic(jnp.zeros(()), jnp.full(len(psi), 0.5)),
+        blend,
+        summarise,
+        lambda statistic, logits: _logit(statistic.share),
+        agreement,
+        _no_confidence,
+    )
 
 
 def printed_perception(
     classes: ReportClasses, predicates: Bool[np.ndarray, "J S A"], available: Bool[np.ndarray, "S A"]
 ) -> Perception:
-    """Eq. 6.7 as printed, every pair a candidate for every report; solutions of sessions are averaged."""
+    """Build Eq. 6.7 as printed, every pair a candidate for every observation; solutions are averaged."""
     empty = FrequencyStatistic(jnp.zeros(()), jnp.full(len(predicates), 0.5))
 
     def hear(kept: FrequencyStatistic, demonstration: Demonstration) -> FrequencyStatistic:
@@ -284,20 +306,25 @@ def printed_perception(
             return kept
         candidates = np.broadcast_to(available / available.sum(), (int(named.sum()), *available.shape))
         solution = solve_printed_program(
-            predicates, demonstration.state[named], demonstration.action[named],
-            demonstration.score[named], candidates,
-        )  # fmt: skip
+            predicates,
+            demonstration.state[named],
+            demonstration.action[named],
+            demonstration.score[named],
+            candidates,
+        )
         return blend(kept, FrequencyStatistic(jnp.ones(()), jnp.asarray(solution.reliabilities)))
 
     return Perception(
-        classes, False, empty,
+        classes,
+        False,
+        empty,
         lambda kept, new: kept,
         lambda logits, session, confidence, pairs: empty,
         lambda statistic, logits: _logit(statistic.share),
         lambda logits, statistic: statistic.share,
         _no_confidence,
         hear=hear,
-    )  # fmt: skip
+    )
 
 
 def _logit(p: Array) -> Array:

@@ -29,10 +29,10 @@ class Fleet(NamedTuple):
 def fleet(learner: Learner) -> Fleet:
     """Map a learner over independent streams in one compiled program.
 
-    ``init(key, streams)`` and ``update(states, demonstrations)``, the arrays of a demonstration being
+    ``init(key, streams)`` and ``update(states, demonstrations)`` take demonstrations of arrays
     ``[streams, n, L]``. Raises ``ValueError`` for a learner whose solver runs outside JAX. Observations
-    are not checked: an impossible one shows as a demonstration log-likelihood of minus infinity, and leaves
-    its learner's state as it was. On a CPU the streams take turns: lanes of a mapped loop would all wait for
+    are not checked: an impossible one gives a demonstration log-likelihood of minus infinity, and leaves its
+    learner's state unchanged. On a CPU the streams run in sequence: lanes of a mapped loop would all wait for
     the slowest of them, at every level of nested loops.
     """
     if learner.session is None:
@@ -60,13 +60,13 @@ def run_streams(
     demonstrations: Demonstration,
     keep: Callable[[Any, SessionInfo], Any] | None = None,
 ) -> tuple[Any, Any]:
-    """Run a learner over whole streams in one compiled program, for studies of many repetitions.
+    """Run a learner over whole streams in one compiled program, for studies of many replications.
 
     ``demonstrations`` holds arrays ``[R, T, n, L]``: ``R`` streams of ``T`` sessions. Returns the final
-    states ``[R]`` and what ``keep(state, info)``, a pure function called after each session (the report
-    by default), gave: arrays ``[R, T]``. Streams run one after the other. Observations are not checked,
-    as in a fleet; of the keys, stream ``i`` gets that which stream ``i`` of a fleet gets.
-    Raises ``ValueError`` for a learner whose solver runs outside JAX, or arrays of another rank.
+    states ``[R]`` and the results of ``keep(state, info)``, a pure function called after each session (the
+    info by default): arrays ``[R, T]``. Streams run one after the other. Observations are not checked, as in
+    a fleet; stream ``i`` gets the key of stream ``i`` of a fleet. Raises ``ValueError`` for a learner whose
+    solver runs outside JAX, or arrays of another rank.
     """
     if learner.session is None:
         raise ValueError(f"{learner.name} solves its programs outside JAX, so it cannot run compiled streams")

@@ -1,9 +1,8 @@
 """The learner protocol (chapter 3): a learner is a pair of functions on an explicit state.
 
 ``init(key)`` gives the state before the first session; ``update(state, demonstration)`` runs one session
-(Definition 4) and returns the new state and a report. The state holds what Definition 7 allows, the reward
-estimate and the sufficient statistic (with warm starts for the solvers), and nothing of earlier
-demonstrations.
+(Definition 4) and returns the new state and an info. The state holds only what Definition 7 allows, the
+reward estimate and the sufficient statistic (with warm starts for the solvers).
 """
 
 from __future__ import annotations
@@ -26,29 +25,29 @@ AnyInfo = TypeVar("AnyInfo", bound=tuple)
 
 @shown_briefly
 class SessionInfo(NamedTuple):
-    """What a session did: plain numbers (from a fleet, arrays with one entry a stream).
+    """Measures of a session: plain numbers (in a fleet, arrays with one entry per stream).
 
     Fields
     ------
     session : int
         Its number, from 1.
     log_likelihood : float
-        ``LL(theta^i | X_i, statistic)`` in nats per trajectory: what the statistic holds once the session is
-        in it, under the new weights. The share of the dynamics, which no weights change, is left out, so
+        ``LL(theta^i | X_i, statistic)`` in nats per trajectory: of the statistic with the session included,
+        under the new weights. The share of the dynamics, which is constant in the weights, is left out, so
         that sessions compare.
     demonstration_log_likelihood : float
         Exact log-likelihood (nats, hidden steps summed out, dynamics included) of this session's
         demonstration alone.
     gradient : float
         Norm of the log-likelihood's gradient in scaled weights (:mod:`~i2rl.models.process.units`) at the
-        weights the session began with: how far this session's data disagree with them. ``|phi_hat - E[phi]|``
-        of scaled features (line 15 of Algorithm 1) with the features statistic.
+        session's first weights: how far this session's data disagree with them. ``|phi_hat - E[phi]|`` of
+        scaled features (line 15 of Algorithm 1) with the features statistic.
     iterations : int
-        E- and M-steps.
+        Number of E- and M-steps.
     solver_iterations : int
         Iterations of the programs' solver, summed over the M-steps.
     converged : bool
-        Whether the session's last program met its tolerance. True for a method that solves none.
+        True if the session's last program met its tolerance, and for methods without programs.
     seconds : float
         Wall-clock time of the session.
     weights : float ``[K]``
@@ -66,12 +65,12 @@ class SessionInfo(NamedTuple):
     weights: Float[np.ndarray, " K"]
 
     def in_plain_numbers(self, seconds: float) -> SessionInfo:
-        """The report of a compiled session with Python's numbers and NumPy's arrays, and the time it took."""
+        """Convert a compiled session's info to Python's numbers and NumPy's arrays, and add its time."""
         return in_plain_numbers(self, seconds)
 
 
 def in_plain_numbers(info: AnyInfo, seconds: float) -> AnyInfo:
-    """A learner's own kind of report in the same form: any named tuple with a field ``seconds``."""
+    """Convert a learner's own info likewise: any named tuple with a field ``seconds``."""
     arrays = {name: np.asarray(value) for name, value in info._asdict().items()}  # type: ignore[attr-defined]
     values: dict[str, Any] = {name: x if x.ndim else x.item() for name, x in arrays.items()}
     return type(info)(**values | {"seconds": seconds})
@@ -81,7 +80,7 @@ class Learner(NamedTuple):
     """An online learner: configuration, and two functions on an explicit state.
 
     ``session`` is the pure, compiled core of ``update`` (state and padded demonstration in, state and
-    report out) that :func:`fleet` maps over many streams; None where a solver runs outside JAX.
+    info out) that :func:`fleet` maps over many streams; None for solvers outside JAX.
     """
 
     name: str
@@ -108,7 +107,7 @@ class Learner(NamedTuple):
 
     @property
     def signature(self) -> str:
-        """Digest of the MDP, the method and its configuration: what a journal must have been made for."""
+        """Digest the MDP, the method and its configuration, which identify a journal's learner."""
         content = json.dumps(
             [self.mdp.fingerprint(), self.name, dict(self.configuration)], sort_keys=True, default=str
         )

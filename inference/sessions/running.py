@@ -13,6 +13,7 @@ from ...models.inputs.display import brief, brief_table, counted, joined
 from ...models.inputs.text import shortened
 from ...models.observation.demonstration import Demonstration
 from .learner import Learner, SessionInfo
+from .progress import told
 from .serialization import demonstration_digest
 from .stopping import StoppingCriterion
 
@@ -38,14 +39,14 @@ class SessionStore(Protocol):
         """Commit a session with the digest of its demonstration."""
 
     def demonstration(self, session: int) -> bytes:
-        """Return the digest of a session's demonstration, empty where it is unknown."""
+        """Return the digest of a session's demonstration; empty if it is unknown."""
 
     def learned_from(self, demonstration: bytes) -> int | None:
-        """Return the session that learned from a demonstration, None if there is none."""
+        """Return the session that learned from a demonstration; None if there is none."""
 
 
 class Run(NamedTuple):
-    """Final state, the sessions' reports, and whether a criterion stopped them."""
+    """Final state, the sessions' infos, and a flag that a criterion stopped them."""
 
     state: Any
     infos: tuple[SessionInfo, ...]
@@ -85,36 +86,38 @@ def run_sessions(
     journal: SessionStore | None = None,
     on_session: Callable[[Any, SessionInfo], None] | None = None,
     whole: bool | None = None,
+    progress: bool = False,
 ) -> Run:
-    """Run one session per demonstration of the stream until it ends or ``stop`` says so (Definition 7).
+    """Run one session per demonstration of the stream until it ends or ``stop`` returns True (Definition 7).
 
-    Starts from ``state``, or where ``journal`` left off, or from ``learner.init(key)``. With a journal every
-    session is committed before the next one begins, with a digest of its demonstration, so that no session
-    is learned twice.
+    It starts from ``state``, from the last session of ``journal``, or from ``learner.init(key)``. With a
+    journal every session is committed before the next one begins, with a digest of its demonstration, so that
+    each demonstration is learned from once.
 
     Parameters
     ----------
     stop : callable, optional
-        Sees the reports of this run.
+        Called with the infos of this run.
     on_session : callable, optional
-        Is called after each session.
+        Called after each session.
     whole : bool, optional
-        Where the stream begins, once the journal has sessions. True: with the first session's demonstration.
-        Those that the journal has are compared, one by one, and skipped. False: after the last session.
-        By default the first demonstration decides. The one of session 1: True. One that no session learned
-        from: False, and a later one that is the session's at the same place is refused. One of another
-        session is refused. A journal that does not know its demonstrations (of version 1, or committed
-        without digests) is continued: False.
+        First demonstration of the stream, if the journal has sessions. True: that of session 1. Those of the
+        journal are compared, one by one, and skipped. False: the one after the last session. By default the
+        first demonstration decides. That of session 1 means True. A new one means False, and a later one that
+        belongs to the session at the same place is refused. One of another session is refused. A journal
+        without digests of its demonstrations (of version 1, or committed without) is continued: False.
+    progress : bool
+        Print the number of each session to standard error; the first one waits for the compiler.
 
     Raises
     ------
     TypeError
-        An argument is no key, no journal, or no iterable of demonstrations.
+        If an argument is not a key, a journal, or an iterable of demonstrations.
     ValueError
-        Neither key, state nor a journal with sessions is given; the journal is another learner's or has other
-        sessions than ``state``; or the stream is not the one that the journal learned from.
+        If neither key, state nor a journal with sessions is given; if the journal is another learner's or has
+        other sessions than ``state``; or if the stream is not that of the journal.
 
-    Whatever ``update`` raises passes through; the state before it stays valid.
+    Errors of ``update`` pass through; the state before it stays valid.
     """
     _require_stream(stream)
     if journal is not None:
@@ -133,15 +136,18 @@ def run_sessions(
         state = learner.init(key)
     infos: list[SessionInfo] = []
     unlearned = ((one, b"") for one in stream) if journal is None else _unlearned(stream, journal, whole)
-    for demonstration, digest in unlearned:
-        state, info = learner.update(state, demonstration)
-        infos.append(info)
-        if journal is not None:
-            journal.commit(state, info, demonstration=digest)
-        if on_session is not None:
-            on_session(state, info)
-        if stop is not None and stop(infos):
-            return Run(state, tuple(infos), True)
+    with told(progress) as tell:
+        for demonstration, digest in unlearned:
+            compiling = "" if infos else ", compiling first"
+            tell(f"{learner.name}: session {int(state.session) + 1}{compiling}")
+            state, info = learner.update(state, demonstration)
+            infos.append(info)
+            if journal is not None:
+                journal.commit(state, info, demonstration=digest)
+            if on_session is not None:
+                on_session(state, info)
+            if stop is not None and stop(infos):
+                return Run(state, tuple(infos), True)
     return Run(state, tuple(infos), False)
 
 
@@ -158,7 +164,7 @@ def _require_stream(stream: Any) -> None:
 def _unlearned(
     stream: Iterable[Demonstration], journal: SessionStore, whole: bool | None
 ) -> Iterator[tuple[Demonstration, bytes]]:
-    """Demonstrations that the journal has no session of, with their digests."""
+    """Yield demonstrations without a session in the journal, with their digests."""
     learned, given, decide = journal.session, 0, whole is None
     advice = "give the whole stream, or with whole=False what comes after it"
     for given, demonstration in enumerate(stream, start=1):
@@ -194,13 +200,13 @@ def _unlearned(
 def average_regret(
     expert: Float[np.ndarray, "... T"], learned: Float[np.ndarray, "... T"]
 ) -> Float[np.ndarray, "... T"]:
-    """Average regret after each session: running mean of the log-likelihood given away.
+    """Return the average regret after each session: the running mean of the lost log-likelihood.
 
     ``expert`` and ``learned`` are the sessions' log-likelihoods under the true weights and under the
     learner's (``learner.log_likelihood(state, true_weights)`` and the infos' ``log_likelihood``); leading
-    axes are streams. The form of chapter 4, ``LL(theta_E | X_i, .) - LL(theta^i | X_i, .)``, whose two sides
-    share their data; Definition 8 prints the previous session's estimate on the previous session's data.
-    Raises ``ValueError`` if shapes differ.
+    axes are streams. It has the form of chapter 4, ``LL(theta_E | X_i, .) - LL(theta^i | X_i, .)``, whose two
+    sides share their data; Definition 8 prints the previous session's estimate on the previous session's
+    data. Raises ``ValueError`` if shapes differ.
     """
     expert, learned = np.asarray(expert, float), np.asarray(learned, float)
     if expert.shape != learned.shape or expert.ndim < 1:

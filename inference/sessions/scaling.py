@@ -1,4 +1,4 @@
-"""Learners that work on scaled features and speak of weights of the features as given."""
+"""Learners that work on scaled features and return weights of the original features."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from .statistic import FeatureStatistic
 
 
 def unscaled(named: Any, scale: Float[Array, " K"]) -> Any:
-    """Return a named tuple whose scaled weights, and features it keeps, are in the units as given."""
+    """Convert the scaled weights and features of a named tuple to the original units."""
     return _translated(named, lambda weights: weights / scale, lambda features: features * scale)
 
 
 def scaled(named: Any, scale: Float[Array, " K"]) -> Any:
-    """Return a named tuple whose weights and features are scaled; :func:`unscaled` is the way back."""
+    """Scale the weights and features of a named tuple; :func:`unscaled` is the inverse."""
     return _translated(named, lambda weights: weights * scale, lambda features: features / scale)
 
 
@@ -34,7 +34,7 @@ def _translated(named: Any, weights: Callable[[Any], Any], features: Callable[[A
 
 
 def _kept(before: Any, inside: Any, new: Any, after: Any) -> Any:
-    """Return ``after``, with what the session left alone as it was to the bit: scaling rounds."""
+    """Return ``after``, with unchanged parts of the state restored to the bit: scaling rounds."""
     changed: dict[str, Any] = {
         "weights": jnp.where(new.weights == inside.weights, before.weights, after.weights)
     }
@@ -47,11 +47,11 @@ def _kept(before: Any, inside: Any, new: Any, after: Any) -> Any:
 
 
 def on_scaled_features(mdp: TabularMDP, build: Callable[[TabularMDP], Learner]) -> Learner:
-    """Build a learner on the process with scaled features, its states and reports in the units as given.
+    """Build a learner on the process with scaled features, its states and infos in the original units.
 
     Slack, priors, initial weights, learning rates and tolerances of the learner then mean scaled weights
-    (:mod:`~i2rl.models.process.units`), and what is learned does not depend on the units of a feature. Where
-    all scales are 1 it is ``build(mdp)`` itself.
+    (:mod:`~i2rl.models.process.units`), and its results do not depend on the units of a feature. If all
+    scales are 1 it is ``build(mdp)`` itself.
     """
     free = with_scaled_features(mdp)
     learner = build(free)

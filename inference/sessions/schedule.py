@@ -1,8 +1,8 @@
 """Slack that changes from session to session: a number, or a schedule, a function of the session's number.
 
 As in Optax, a schedule is any function that JAX can trace, from the session's number (an int, counted from
-1) to the slack. It is a pure function of that number, so a learner that resumes from a journal goes on
-with it.
+1) to the slack. It is a pure function of that number, so a learner that resumes from a journal continues with
+it.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ from numpy.typing import ArrayLike
 # Harmonic by name: type checkers do not see that a named tuple can be called.
 Schedule: TypeAlias = "float | Harmonic | Callable[[Int[Array, '']], ArrayLike]"
 
-# So many sessions of a schedule are looked at when a learner is made, and identify it.
+# This many sessions of a schedule are evaluated when a learner is made, and identify it.
 EXAMINED = 1000
 
 
 class Harmonic(NamedTuple):
     """The diminishing threshold of the no-regret theorem, ``epsilon_i / (1 - gamma) = c / i`` (Eq. 4.3).
 
-    ``c / i`` is the program's own slack ``beta_i`` in session ``i``, whatever the statistic, so nobody
-    divides it again by ``1 - gamma``. With the ``features`` statistic it is how far discounted feature
-    expectations may be from the demonstrated ones, and ``epsilon_i = c (1 - gamma) / i``. With ``counts``
-    and ``seen`` it is an L1 penalty of ``c / i`` nats per trajectory and unit of weight; as the statistic
-    grows by a fixed number of trajectories a session, that is a penalty of fixed strength in all: a
-    Laplace prior, which the data outgrow.
+    ``c / i`` is the program's own slack ``beta_i`` in session ``i``, whatever the statistic; do not divide it
+    again by ``1 - gamma``. With the ``features`` statistic it bounds the distance of discounted feature
+    expectations from the demonstrated ones, and ``epsilon_i = c (1 - gamma) / i``. With ``counts`` and
+    ``seen`` it is an L1 penalty of ``c / i`` nats per trajectory and unit of weight. The statistic grows by a
+    fixed number of trajectories per session, so this penalty has fixed strength in all: a Laplace prior,
+    which the data outgrow.
     """
 
     c: float
 
     def __call__(self, session: Int[Array, ""]) -> Any:
-        """``c / session``."""
+        """Return ``c / session``."""
         return self.c / session
 
 
 def program_slack(slack: Any, session: Any, unit: Any) -> Float[Array, ""]:
-    """The program's slack ``beta`` in a session.
+    """Return the program's slack ``beta`` in a session.
 
-    ``unit`` is what a slack of one means to the program; :class:`Harmonic` states ``beta`` itself. NaN where
-    a schedule asks for a negative slack: under ``jit`` nothing can be raised, and a program with that slack
-    is not solved, so the weights stay what they were.
+    ``unit`` is the program's value of a slack of one; :class:`Harmonic` states ``beta`` itself. A negative
+    slack of a schedule becomes NaN: ``jit`` cannot raise errors, and a program with that slack is not solved,
+    so the weights stay unchanged.
     """
     if isinstance(slack, Harmonic):
         beta = slack(session)
@@ -59,9 +59,9 @@ def program_slack(slack: Any, session: Any, unit: Any) -> Float[Array, ""]:
 
 
 def require_slack(slack: Any) -> None:
-    """Raise ``ValueError`` unless ``slack`` is a number or a schedule, and nowhere negative.
+    """Raise ``ValueError`` unless ``slack`` is a number or a schedule, and never negative.
 
-    Of a schedule the first ``EXAMINED`` sessions are looked at.
+    The first ``EXAMINED`` sessions of a schedule are checked.
     """
     if not callable(slack):
         scalar = isinstance(slack, np.ndarray | jax.Array) and slack.ndim == 0
@@ -81,7 +81,7 @@ def require_slack(slack: Any) -> None:
 
 
 def require_slack_in(slack: Any, session: int) -> None:
-    """Raise ``ValueError`` where a schedule gives no possible slack in a session beyond those examined."""
+    """Raise ``ValueError`` if a schedule gives an invalid slack in a session beyond those examined."""
     if callable(slack) and session > EXAMINED:
         value = float(slack(jnp.asarray(session)))
         if not 0 <= value < math.inf:
@@ -89,9 +89,9 @@ def require_slack_in(slack: Any, session: int) -> None:
 
 
 def described(slack: Any) -> float | str:
-    """What identifies a slack in a learner's configuration, the same in every process.
+    """Return the identity of a slack in a learner's configuration, the same in every process.
 
-    A schedule without a readable representation is known by its values: two that agree on the sessions
+    A schedule without a readable representation is identified by its values: two that agree on the sessions
     examined (to 10 digits) are one.
     """
     if not callable(slack):

@@ -1,13 +1,13 @@
-"""Pytrees of arrays as bytes, every bit kept: the form in which a learner's state is stored.
+"""Pytrees of arrays as bytes, exact to the bit: the stored form of a learner's state.
 
-No pickles: reading executes nothing, and the bytes outlive the classes they came from. The layout::
+No pickles: reading executes no code, and the bytes outlive the classes they came from. The layout::
 
     magic | header length (uint32, little-endian) | header (JSON) | leaves | BLAKE2b of all before (16 bytes)
 
 The header lists ``[name, kind, dtype, shape]`` of every leaf in flattening order; a leaf is its elements in C
-order. Containers are kept only as the paths of their leaves, and static fields not at all: :func:`restore`
-takes both from a template. :func:`decode` trusts nothing of this: every entry of a header is checked before
-an array is made from it.
+order. The bytes store containers only as the paths of their leaves, and omit static fields: :func:`restore`
+takes both from a template. :func:`decode` trusts no entry of a header: each is checked before an array is
+made from it.
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ class Leaf(NamedTuple):
     Fields
     ------
     kind : str
-        What it was: ``none``, ``text``, ``python`` (a number), ``scalar`` (of NumPy), ``numpy``, ``jax``, or
-        ``key:threefry2x32`` (a typed random key and its implementation).
+        Original type: ``none``, ``text``, ``python`` (a number), ``scalar`` (of NumPy), ``numpy``, ``jax``,
+        or ``key:threefry2x32`` (a typed random key and its implementation).
     value : array
-        Its elements; of a text the UTF-8 bytes, of a key the key data.
+        Its elements: of a text the UTF-8 bytes, of a key the key data.
     """
 
     kind: str
@@ -56,7 +56,7 @@ class Leaf(NamedTuple):
 
     @property
     def plain(self) -> Any:
-        """The leaf without JAX: a NumPy array or scalar, a Python number, text or None; of a key its data."""
+        """Return the leaf without JAX: a NumPy array or scalar, a Python number, text, None or key data."""
         if self.kind == "none":
             return None
         if self.kind == "text":
@@ -65,7 +65,7 @@ class Leaf(NamedTuple):
 
     @property
     def is_key(self) -> bool:
-        """Whether it is a typed random key."""
+        """True for a typed random key."""
         return self.kind.startswith(_KEY)
 
     def __str__(self) -> str:
@@ -77,9 +77,9 @@ class Leaf(NamedTuple):
 
 
 def encode(tree: Any) -> bytes:
-    """Bytes of a pytree of arrays, numbers, text, typed random keys and None.
+    """Encode a pytree of arrays, numbers, text, typed random keys and None as bytes.
 
-    Raises ``TypeError`` naming a leaf that is none of these, and ``ValueError`` for more than
+    Raises ``TypeError`` naming a leaf of another type, and ``ValueError`` for more than
     :data:`MOST_LEAVES` leaves.
     """
     leaves = {name: _leaf(name, value) for name, value in _flatten(tree)[0].items()}
@@ -96,9 +96,9 @@ def encode(tree: Any) -> bytes:
 
 
 def decode(blob: bytes) -> dict[str, Leaf]:
-    """The leaves of :func:`encode` by name (``statistic.counts``); a tree of one leaf has the name ``""``.
+    """Decode the leaves of :func:`encode` by name (``statistic.counts``); a single leaf has the name ``""``.
 
-    Raises ``ValueError`` where the bytes are damaged.
+    Raises ``ValueError`` if the bytes are damaged.
     """
     body, digest = memoryview(blob)[:-DIGEST_SIZE], blob[-DIGEST_SIZE:]
     start = len(_MAGIC) + 4
@@ -120,9 +120,9 @@ def decode(blob: bytes) -> dict[str, Leaf]:
 
 
 def demonstration_digest(demonstration: Any) -> bytes:
-    """Digest of what a demonstration says, by which a session that learned from it is recognised.
+    """Digest the content of a demonstration, which identifies its session.
 
-    Any pytree that :func:`encode` takes is one. The same arrays of NumPy and of JAX have one digest; of a
+    It takes any pytree that :func:`encode` takes. The same arrays of NumPy and of JAX have one digest; for a
     :class:`Demonstration` neither padding nor the width of its integers counts. Raises ``TypeError`` as
     :func:`encode` does.
     """
@@ -147,7 +147,7 @@ def _trimmed(demonstration: Demonstration) -> Demonstration:
 
 
 class _Description(NamedTuple):
-    """A leaf as a header describes it, and its size in bytes."""
+    """Description of a leaf in a header, and its size in bytes."""
 
     name: str
     kind: str
@@ -157,7 +157,7 @@ class _Description(NamedTuple):
 
 
 def _header(text: bytes) -> list[_Description]:
-    """The leaves of a header, once every entry makes sense."""
+    """Read the leaves of a header after checking every entry."""
     if len(text) > _LONGEST_HEADER:
         raise ValueError(f"the bytes are damaged (their header is longer than {_LONGEST_HEADER:,} bytes)")
     try:
@@ -203,18 +203,18 @@ def _described(entry: Any) -> _Description | None:
 
 
 def _axes(kind: str, given: int) -> int:
-    """How many axes a leaf of the kind has, where that is fixed."""
+    """Return the number of axes of a leaf of the kind, if that is fixed."""
     return {"none": 1, "text": 1, "python": 0, "scalar": 0}.get(kind, given)
 
 
 def restore(leaves: Mapping[str, Leaf], template: Any) -> Any:
-    """The tree with these leaves, to the bit, in the template's containers.
+    """Rebuild the tree with these leaves, to the bit, in the template's containers.
 
-    A leaf must have the template's type and shape, with exceptions for what exists only once learning has
-    begun: where the template has None anything may stand; where it has an array without elements, any shape
-    of its type, or None. A Python number in the template stands for any width of its kind, and a random key
-    keeps the implementation it was stored with; a legacy key (two integers) becomes the typed key that draws
-    the same. Raises ``ValueError`` naming the leaf that does not fit.
+    A leaf must have the template's type and shape, with exceptions for parts that exist only after the first
+    session: a None in the template accepts any leaf; an array without elements accepts any shape of its type,
+    or None. A Python number in the template accepts any width of its kind, and a random key keeps its stored
+    implementation; a legacy key (two integers) becomes the typed key with the same draws. Raises
+    ``ValueError`` naming the leaf that does not fit.
     """
     expected, structure = _flatten(template)
     if list(expected) != list(leaves):
@@ -290,7 +290,7 @@ def _fits(stored: Leaf, like: Leaf) -> bool:
 
 
 def _is_legacy_key(stored: Leaf, like: Leaf) -> bool:
-    """Whether an array of JAX is what ``jax.random.PRNGKey`` makes of the key that is expected."""
+    """Return whether an array of JAX is the ``jax.random.PRNGKey`` form of the expected key."""
     same_data = stored.value.dtype == np.uint32 and stored.value.shape == like.value.shape
     return stored.kind == "jax" and like.kind == f"{_KEY}threefry2x32" and same_data
 

@@ -1,19 +1,19 @@
-"""Sufficient statistics: all that an online learner keeps of the demonstrations it has seen (Definition 7).
+"""Sufficient statistics: the summary of all past demonstrations in an online learner (Definition 7).
 
-Three are offered, running averages over trajectories as in Eq. 4.2. They differ in what they keep of the
-steps that were *not* seen, and so in how much an early, poor guess at them weighs later:
+Three are offered, running averages over trajectories as in Eq. 4.2. They differ in the treatment of *hidden*
+steps, and therefore in the later weight of early, poor completions:
 
 ``features``
     Discounted feature expectations of the completed, infinitely continued trajectories, the
-    dissertation's. With short fragments most of it is the tail filled in by the guess itself.
+    dissertation's. For short fragments most of it is the completed tail.
 ``counts``
-    Expected visits ``N(s, a)`` of all steps. No tail, but hidden steps are still filled in once and kept.
+    Expected visits ``N(s, a)`` of all steps. There is no tail, but hidden steps are completed once for good.
 ``seen``
-    Expected visits of the steps that were seen. Given the state, whether a step is in view says nothing
-    about its action, so the conditional likelihood of the seen actions is a proper (composite) likelihood;
-    the hidden steps of the current session count in full through its exact likelihood, and are then let go
-    rather than kept as a guess. With full observability it equals ``counts``. A noisy or partial reading is
-    kept as its posterior under the weights of its session.
+    Expected visits of the seen steps. Given the state, visibility does not depend on the action, so the
+    conditional likelihood of the seen actions is a proper (composite) likelihood. The hidden steps of the
+    current session count in full through its exact likelihood, and are then dropped. With full visibility it
+    equals ``counts``. A noisy or partial observation enters by its posterior under the weights of its
+    session.
 """
 
 from __future__ import annotations
@@ -58,17 +58,17 @@ class Completed(NamedTuple):
 def complete(
     mdp: TabularMDP, posterior: Smoothed, live: Bool[Array, "n L"], seen: Bool[Array, "n L"]
 ) -> Completed:
-    """Collect what the statistics need from the posterior over a session's pairs."""
+    """Collect the data of the statistics from the posterior over a session's pairs."""
     return Completed(
         collect(mdp, posterior, live), jnp.einsum("nlsa,nl->sa", posterior.pairs, seen.astype(float))
     )
 
 
 def blend(kept: Any, new: Any, forgetting: float = 1.0) -> Any:
-    """Running average of two statistics of one type, weighted by their sizes (Eq. 4.2).
+    """Average two statistics of one type, weighted by their sizes (Eq. 4.2).
 
-    ``forgetting`` is the exponent of the new one's share. At 1 everything counts alike; below, what was
-    guessed under early weights is slowly forgotten, as stochastic-approximation EM needs it (Cappe and
+    ``forgetting`` is the exponent of the new one's share. At 1 all sessions count alike; below, completions
+    under early weights are slowly forgotten, as stochastic-approximation EM requires (Cappe and
     Moulines 2009: between 1/2 and 1).
     """
     total = kept.size + new.size
@@ -78,26 +78,26 @@ def blend(kept: Any, new: Any, forgetting: float = 1.0) -> Any:
 
 
 class Statistic(Protocol):
-    """How a learner summarises a session, keeps the summary, and fits weights to it."""
+    """Summary of sessions in a learner, and the fit of weights to it."""
 
     name: str
 
     def empty(self, mdp: TabularMDP) -> Any:
-        """The statistic before the first session."""
+        """Return the statistic before the first session."""
 
     def of_session(self, mdp: TabularMDP, plan: SoftPlan, completed: Completed) -> Any:
-        """The session's summary while it is the current one, under the policy it was completed with."""
+        """Summarise the current session, under the policy that completed it."""
 
     def to_keep(self, mdp: TabularMDP, plan: SoftPlan, completed: Completed) -> Any:
-        """The session's summary once it is over."""
+        """Summarise a session after its end."""
 
     def slack(self, mdp: TabularMDP, epsilon: Any) -> Any:
-        """The program's slack ``beta`` for a relaxation ``epsilon``."""
+        """Return the program's slack ``beta`` for a relaxation ``epsilon``."""
 
     def log_likelihood(
         self, mdp: TabularMDP, weights: Float[Array, " K"], values: Float[Array, " S"], kept: Any
     ) -> Float[Array, ""]:
-        """Mean log-likelihood per trajectory of what is kept, given weights and their soft values."""
+        """Return the statistic's mean log-likelihood per trajectory, given weights and their soft values."""
 
 
 class _Features:
@@ -115,11 +115,11 @@ class _Features:
     to_keep = of_session
 
     def slack(self, mdp: TabularMDP, epsilon: Any) -> Any:
-        """``beta = epsilon / (1 - gamma)``, the relaxed constraint of Theorem 1."""
+        """Return ``beta = epsilon / (1 - gamma)``, the relaxed constraint of Theorem 1."""
         return epsilon / (1 - mdp.discount)
 
     def log_likelihood(self, mdp: TabularMDP, weights: Array, values: Array, kept: FeatureStatistic) -> Array:
-        """``sum_t gamma^t log pi(a_t | s_t)`` of the continued trajectories.
+        """Return ``sum_t gamma^t log pi(a_t | s_t)`` of the continued trajectories.
 
         It telescopes to this in expectation over the dynamics.
         """
@@ -139,11 +139,11 @@ class _Counts:
     to_keep = of_session
 
     def slack(self, mdp: TabularMDP, epsilon: Any) -> Any:
-        """``epsilon`` itself, in nats per trajectory and unit of weight."""
+        """Return ``epsilon`` itself, in nats per trajectory and unit of weight."""
         return epsilon
 
     def log_likelihood(self, mdp: TabularMDP, weights: Array, values: Array, kept: CountStatistic) -> Array:
-        """``sum N log pi`` over the kept visits."""
+        """Return ``sum N log pi`` over the visits."""
         log_policy = action_values(mdp, reward_of(mdp, weights), values) - values[:, None]
         return jnp.sum(kept.counts * jnp.where(mdp.available, log_policy, 0.0))
 

@@ -1,4 +1,4 @@
-"""Stopping criteria: functions of the reports so far."""
+"""Stopping criteria: functions of the infos so far."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from .learner import SessionInfo
 
 
 class StoppingCriterion(Protocol):
-    """Decides from the reports so far whether the sessions should end."""
+    """Criterion that ends the sessions, given their infos so far."""
 
     def __call__(self, infos: Sequence[SessionInfo]) -> bool:
-        """Whether to stop after the last report."""
+        """Return whether to stop after the last info."""
 
 
 class LikelihoodChange(NamedTuple):
@@ -29,7 +29,7 @@ class LikelihoodChange(NamedTuple):
     rho: float
 
     def __call__(self, infos: Sequence[SessionInfo]) -> bool:
-        """Whether to stop after the last report."""
+        """Return whether to stop after the last info."""
         if len(infos) < 2:
             return False
         return abs(infos[-1].log_likelihood - infos[-2].log_likelihood) <= self.rho
@@ -53,7 +53,7 @@ class LearningErrorChange:
         self._error = jax.jit(error)
 
     def __call__(self, infos: Sequence[SessionInfo]) -> bool:
-        """Whether to stop after the last report."""
+        """Return whether to stop after the last info."""
         if len(infos) < 2:
             return False
         before, after = (float(self._error(_one_reward(r))) for r in infos[-2:])
@@ -61,12 +61,12 @@ class LearningErrorChange:
 
 
 class MovingWindow:
-    """Against early stopping (chapter 4): the standard deviation over the last ``width`` sessions is small.
+    """Guard against early stopping (chapter 4): small deviation over the last ``width`` sessions.
 
-    ``of`` is the field of the info that must settle within ``tolerance``: ``log_likelihood`` or
-    ``gradient``. What protects is the width: where nothing is seen everything stands still, so it should
-    exceed the longest stretch of sessions without a sighting. Raises ``ValueError`` for another field or a
-    width below 2.
+    ``of`` is the field of the info whose standard deviation must be within ``tolerance``: ``log_likelihood``
+    or ``gradient``. The width is the protection: all fields are constant while the expert is out of view, so
+    the width should exceed the longest stretch of hidden sessions. Raises ``ValueError`` for another field or
+    a width below 2.
     """
 
     def __init__(self, width: int, tolerance: float, of: str = "log_likelihood") -> None:
@@ -77,18 +77,18 @@ class MovingWindow:
         self.width, self.tolerance, self.of = width, tolerance, of
 
     def __call__(self, infos: Sequence[SessionInfo]) -> bool:
-        """Whether to stop after the last report."""
+        """Return whether to stop after the last info."""
         if len(infos) < self.width:
             return False
         return float(np.std([getattr(r, self.of) for r in infos[-self.width :]])) <= self.tolerance
 
 
 class PolicyWindow:
-    """The learned behaviour has settled: the greedy policies of the last ``width`` sessions agree.
+    """Criterion of settled behaviour: the greedy policies of the last ``width`` sessions agree.
 
-    Each may differ from the current one in at most the share ``tolerance`` of all states. Needs no expert,
-    has no unit that depends on the data, and looks at what the learner is for: rewards may go on moving
-    where no decision depends on them. Raises ``ValueError`` for a width below 2 or a share outside [0, 1].
+    Each may differ from the current one in at most the share ``tolerance`` of all states. It needs no expert,
+    has no unit that depends on the data, and measures the policy itself: rewards may change further without
+    any effect on it. Raises ``ValueError`` for a width below 2 or a share outside [0, 1].
     """
 
     def __init__(self, width: int, tolerance: float, mdp: TabularMDP) -> None:
@@ -107,7 +107,7 @@ class PolicyWindow:
         self._actions = jax.jit(actions)
 
     def __call__(self, infos: Sequence[SessionInfo]) -> bool:
-        """Whether to stop after the last report."""
+        """Return whether to stop after the last info."""
         if len(infos) < self.width:
             return False
         actions = np.asarray(self._actions(np.stack([_one_reward(r) for r in infos[-self.width :]])))

@@ -1,4 +1,4 @@
-"""Archives of plain arrays (``.npz``), checked by their headers before anything is read, within a limit."""
+"""Archives of plain arrays (``.npz``), checked by their headers before they are read, within a limit."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ import numpy as np
 from .text import shortened
 
 MAX_BYTES = 2**30
-"""The most bytes that the arrays of an archive may take, unless a reader is given another limit: 1 GiB."""
+"""Default limit of the bytes of an archive's arrays: 1 GiB."""
 
 _MAX_HEADER = 4096
 _MAX_DIMENSIONS = 8
@@ -25,8 +25,19 @@ _LAST_CHARACTER = 0x10FFFF
 _MAX_PIECE = 2**17
 _ENCRYPTED = 0x1
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_WORDS = {"b": "booleans", "i": "integers", "u": "integers", "f": "real numbers", "U": "text", "S": "bytes",
-          "c": "complex numbers", "O": "objects", "V": "records", "M": "dates", "m": "durations"}  # fmt: skip
+_WORDS = {
+    "b": "booleans",
+    "i": "integers",
+    "u": "integers",
+    "f": "real numbers",
+    "U": "text",
+    "S": "bytes",
+    "c": "complex numbers",
+    "O": "objects",
+    "V": "records",
+    "M": "dates",
+    "m": "durations",
+}
 # The kinds of header: bytes of its length, and its encoding.
 _VERSIONS = {(1, 0): (2, "latin-1"), (2, 0): (4, "latin-1"), (3, 0): (4, "utf-8")}
 _FIELD = re.compile(
@@ -36,7 +47,7 @@ _HEADER = re.compile(rf"\{{\s*{_FIELD.pattern}(?:\s*,\s*{_FIELD.pattern}){{2}}(?
 
 
 class StorageError(ValueError):
-    """A file that is not what it should be; the message names the file and, where there is one, the array."""
+    """A file that is invalid; the message names the file and, if there is one, the array."""
 
 
 class _Header(NamedTuple):
@@ -55,18 +66,18 @@ def read_arrays(
     what: str = "archive",
     max_bytes: int = MAX_BYTES,
 ) -> dict[str, np.ndarray]:
-    """Read the arrays of an ``.npz`` file. Nothing in it is executed, and nothing unexpected is read.
+    """Read the arrays of an ``.npz`` file; execute nothing in it and read no unexpected array.
 
     The arrays are read only after the list of entries and the header of every array have shown that their
-    names are known, their types allowed, their sizes consistent, and all of them together no larger than
-    ``max_bytes``. They are then inflated piece by piece into memory of just that size.
+    names are known, their types allowed, their sizes consistent, and their total within ``max_bytes``. They
+    are then inflated piece by piece into memory of that size.
 
     Parameters
     ----------
     path : path
     kinds : mapping from str to str
-        For each array that the file may have, NumPy's letters for the kinds of type allowed: ``"iu"`` for
-        integers, ``"f"`` for real numbers.
+        NumPy's letters for the kinds of type that each possible array may have: ``"iu"`` for integers,
+        ``"f"`` for real numbers.
     required : sequence of str
         Arrays that the file must have.
     what : str
@@ -90,14 +101,14 @@ def read_arrays(
                 return {name: _array(archive, name, entries[name], headers[name]) for name in entries}
         except StorageError as error:
             raise StorageError(f"{path}: {error}") from None
-        # zipfile and zlib answer damaged archives with a dozen kinds of exceptions.
+        # zipfile and zlib raise a dozen kinds of exceptions for damaged archives.
         except Exception as error:
             reason = shortened(str(error), 200)[1:-1] or type(error).__name__
             raise StorageError(f"{path}: not an {what} (.npz of plain arrays): {reason}") from None
 
 
 class _Pieces:
-    """A file that refuses to be read in large pieces."""
+    """A file whose reads are limited to small pieces."""
 
     def __init__(self, file: IO[bytes]) -> None:
         self._file = file

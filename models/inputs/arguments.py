@@ -1,4 +1,4 @@
-"""Arguments in the forms that users have them: numbers of any library, random keys, parameters in a tuple."""
+"""Arguments in the forms users have: numbers of any library, random keys, parameters in a tuple."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ Fields = TypeVar("Fields", bound=type)
 
 
 def concrete(name: str, given: Any, dtype: type | None = float) -> np.ndarray | None:
-    """Convert an argument to a NumPy array; None where JAX traces it, so that there are no numbers to check.
+    """Convert an argument to a NumPy array; return None if JAX traces it and it has no numbers to check.
 
-    ``dtype`` None keeps the argument's own. Raises ``TypeError`` for what is no array of numbers, and
+    ``dtype`` None keeps the argument's own. Raises ``TypeError`` for anything but an array of numbers, and
     ``ValueError`` for masked entries.
     """
     if is_traced(given):
@@ -40,17 +40,17 @@ def concrete(name: str, given: Any, dtype: type | None = float) -> np.ndarray | 
 
 
 def is_traced(given: Any) -> bool:
-    """Say whether JAX traces an argument, or an entry of a list or tuple of them."""
+    """Return whether JAX traces an argument, or an entry of a list or tuple of them."""
     if isinstance(given, list | tuple):
         return any(is_traced(entry) for entry in given)
     return isinstance(given, Tracer)
 
 
 def as_key(key: Any) -> Array:
-    """Take one JAX random key, or make one of a seed.
+    """Take one JAX random key, or make one from a seed.
 
-    A legacy key (``jax.random.PRNGKey``) becomes the typed key that draws the same. Raises ``TypeError`` for
-    what is neither.
+    A legacy key (``jax.random.PRNGKey``) becomes the typed key with the same draws. Raises ``TypeError`` for
+    anything else.
 
     Examples
     --------
@@ -72,8 +72,8 @@ def as_key(key: Any) -> Array:
 def rebuilt_unchecked(cls: Fields) -> Fields:
     """Let JAX, pickles and copies rebuild a checked named tuple without calling ``__new__``.
 
-    Leaves are traced, or placeholders without numbers, or arrays that were checked when a user gave them:
-    a check of these would cost a copy from the device whenever a compiled function returns. ``_make`` does
+    Leaves are traced, or placeholders without numbers, or arrays that were checked when a user gave them.
+    Checking them again would cost a copy from the device whenever a compiled function returns. ``_make`` does
     the same in the library's own code; ``_replace`` checks.
     """
     fields: Any = cls
@@ -95,7 +95,7 @@ def rebuilt_unchecked(cls: Fields) -> Fields:
 
 
 def described(given: Any) -> str:
-    """Describe an argument in a message: type, shape and the beginning of what it prints."""
+    """Describe an argument in a message: type, shape and the beginning of its text."""
     shape = getattr(given, "shape", None)
     if shape is not None and hasattr(given, "dtype"):
         return f"{type(given).__name__} of {given.dtype} with shape {list(shape)}"

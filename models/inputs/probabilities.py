@@ -1,4 +1,4 @@
-"""Sums of probabilities that were given in finite precision: tolerance, and normalisation to the bit."""
+"""Sums of probabilities given in finite precision: tolerance, and normalisation exact to the bit."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Float
 
 _DOUBLE = float(np.finfo(np.float64).eps)
-# Probabilities in 64 bits may be decimals that somebody wrote with eight digits.
+# 64-bit probabilities may be decimals written with eight digits.
 _DECIMALS = 1e-8
 
 
 def sum_tolerance(dtype: Any, size: int) -> float:
-    """Return how far from one ``size`` probabilities given in ``dtype`` may sum.
+    """Return the tolerance from one of a sum of ``size`` probabilities given in ``dtype``.
 
     64-bit numbers, integers and booleans: 1e-8. Shorter floats (``float32``, ``bfloat16``): the rounding of
     each number and of their sum, ``4 sqrt(size)`` units of the precision, at most 1/100.

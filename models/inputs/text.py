@@ -1,4 +1,4 @@
-"""Text from outside: JSON that cannot crash its reader, and values in messages, cut to a readable length."""
+"""Text from outside: safe parsing of JSON, and values in messages, cut to a readable length."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 
 class _Short(reprlib.Repr):
-    """Representations that stay short, of integers of any length as well."""
+    """Representations that stay short, also of integers of any length."""
 
     def __init__(self, limit: int) -> None:
         super().__init__()
@@ -45,7 +45,7 @@ def listed(names: Any, most: int = 4, limit: int = 40) -> str:
 
 
 class JSONError(ValueError):
-    """Text that is not JSON, or not plainly so; the message says why."""
+    """Text that is not JSON, or ambiguous JSON; the message says why."""
 
 
 class JSONSyntaxError(JSONError):
@@ -53,9 +53,9 @@ class JSONSyntaxError(JSONError):
 
 
 def parsed_json(text: str) -> Any:
-    """Parse JSON text. Raises :class:`JSONError` for whatever cannot be read.
+    """Parse JSON text. Raises :class:`JSONError` for text that cannot be read.
 
-    Refused are, beside errors of syntax, nesting deeper than Python's stack, integers of more digits than
+    Beside errors of syntax it refuses nesting deeper than Python's stack, integers of more digits than
     Python converts (4,300), and objects that have a field twice. ``NaN`` and ``Infinity`` are read as floats.
     """
     try:

@@ -2,14 +2,15 @@
 
 Behaviour is ``p0(s_0) prod_t pi(a_t | s_t) P(s_{t+1} | s_t, a_t)``; evidence multiplies it step by step.
 Policy and evidence enter only through their product, the factors ``log pi(a | s) + log e_t(s, a)`` given
-as ``[L, S, A]``. One pass costs ``O(L S A B)``. Each step is normalised, so length never underflows.
+as ``[L, S, A]``. One pass costs ``O(L S A B)``. Each step is normalised, so long trajectories cannot
+underflow.
 
-Passes are made with probabilities as plain numbers, which is three times as fast as with logarithms, and
-watch whether a state became so unlikely that a double may lose it. Where later evidence may yet turn to such
-a state, the passes are made again with logarithms: results are exact however unlikely the truth is.
+Passes use plain probabilities, three times as fast as logarithms, and detect states so unlikely that a
+double may lose them. If later evidence may favour such a state, the passes are repeated with logarithms:
+results are exact however unlikely the truth is.
 
-Functions take one trajectory or, those named ``_all``, many ``[n, ...]``. Map over many with those: ``vmap``
-would make both passes every time.
+Functions take one trajectory; those named ``_all`` take many ``[n, ...]``. Use these for many: ``vmap`` of
+the others would make both passes every time.
 """
 
 from __future__ import annotations
@@ -29,13 +30,13 @@ from ..process.mdp import TabularMDP
 
 Passed = TypeVar("Passed", bound=tuple)
 
-# A possible pair of a smaller share of its step's probability, or a smaller chance of a transition, may be
-# lost to rounding in what follows: products of two such numbers and of a message leave the range of doubles.
+# A possible pair with a smaller share of its step's probability, or a transition of smaller probability, may
+# be lost to rounding: products of two such numbers and of a message leave the range of doubles.
 _SMALL = 1e-140
-# Nats by which the evidence after a loss must have been disappointed, at least, for the loss to matter: up to
-# these what was lost is less than 1e-16 of the posterior (1e-140 e^250 = 3e-32).
+# A loss matters only if the later evidence falls short by at least this many nats. Below, the lost mass is
+# less than 1e-16 of the posterior (1e-140 e^250 = 3e-32).
 _DISAPPOINTED = 250.0
-# Reciprocals of smaller numbers are infinite.
+# Smaller numbers have infinite reciprocals.
 _TINY = 1e-300
 
 
@@ -68,9 +69,9 @@ class Smoothed(NamedTuple):
 
 @shown_briefly
 class SmoothedTransitions(NamedTuple):
-    """Forward-backward pass that keeps transitions, ``P(s_t, a_t, s_{t+1} | all evidence)``.
+    """Forward-backward pass with the transitions, ``P(s_t, a_t, s_{t+1} | all evidence)``.
 
-    After the last step the successor is distributed as the dynamics have it.
+    After the last step the successor follows the dynamics.
     """
 
     log_likelihood: Float[Array, ""]
@@ -78,36 +79,36 @@ class SmoothedTransitions(NamedTuple):
 
 
 def filter_all(mdp: TabularMDP, factors: Float[Array, "n L S A"], live: Bool[Array, "n L"]) -> Filtered:
-    """Forward passes; ``live`` is false on padding. Differentiable in factors, transitions and ``p0``."""
+    """Run forward passes; ``live`` is false on padding. Differentiable in factors, transitions and ``p0``."""
     return _exactly(_filtered, _filtered_in_logs, mdp, factors, live)
 
 
 def smooth_all(mdp: TabularMDP, factors: Float[Array, "n L S A"], live: Bool[Array, "n L"]) -> Smoothed:
-    """Forward-backward passes (the exact E-step, replacing the MCMC of Algorithm 1)."""
+    """Run forward-backward passes (the exact E-step, replacing the MCMC of Algorithm 1)."""
     return _exactly(_smoothed, _smoothed_in_logs, mdp, factors, live)
 
 
 def smooth_transitions_all(
     mdp: TabularMDP, factors: Float[Array, "n L S A"], live: Bool[Array, "n L"]
 ) -> SmoothedTransitions:
-    """Forward-backward passes that keep the transitions."""
+    """Run forward-backward passes and return the transitions."""
     return _exactly(_transitions, _transitions_in_logs, mdp, factors, live)
 
 
 def filter_forward(mdp: TabularMDP, factors: Float[Array, "L S A"], live: Bool[Array, " L"]) -> Filtered:
-    """:func:`filter_all` of one trajectory."""
+    """Run :func:`filter_all` on one trajectory."""
     return jax.tree.map(lambda x: x[0], filter_all(mdp, factors[None], live[None]))
 
 
 def smooth(mdp: TabularMDP, factors: Float[Array, "L S A"], live: Bool[Array, " L"]) -> Smoothed:
-    """:func:`smooth_all` of one trajectory."""
+    """Run :func:`smooth_all` on one trajectory."""
     return jax.tree.map(lambda x: x[0], smooth_all(mdp, factors[None], live[None]))
 
 
 def condition(
     mdp: TabularMDP, belief: Float[Array, " S"], factors: Float[Array, "S A"]
 ) -> Float[Array, " S"]:
-    """Distribution of the next state after one step with these factors; zeros if they are impossible."""
+    """Return the distribution of the next state after one step; zeros if the factors are impossible."""
     return mdp.push_forward(_shares(_weigh(belief, factors)[0]))
 
 
@@ -138,11 +139,11 @@ def _exactly(
     factors: Float[Array, "n L S A"],
     live: Bool[Array, "n L"],
 ) -> Passed:
-    """Passes in plain numbers, and in logarithms those of trajectories that lost something by it."""
+    """Run passes in plain numbers, and again in logarithms for trajectories with a loss that matters."""
     every = partial(jax.vmap, in_axes=(None, 0, 0))
     forward = every(_forward)(mdp, factors, live)
 
-    # Nothing but its arguments is kept for a derivative of what is hardly ever computed.
+    # A derivative stores only the arguments: the branch of logarithms is hardly ever computed.
     again = jax.checkpoint(every(in_logs))
 
     # Outside the branches, so that it is compiled once.
@@ -161,7 +162,7 @@ def _exactly(
 
 
 class _Forward(NamedTuple):
-    """Forward pass in plain numbers; ``lost`` says whether something that may matter was lost to rounding."""
+    """Forward pass in plain numbers; ``lost`` marks a loss to rounding that may matter."""
 
     log_likelihood: Float[Array, ""]
     predicted: Float[Array, "L S"]
@@ -170,12 +171,12 @@ class _Forward(NamedTuple):
 
 
 def _bounded_exp(x: Array) -> Array:
-    """``exp(min(x, 0))`` with the derivative of ``exp`` at zero, where ``jnp.minimum`` halves it."""
+    """Compute ``exp(min(x, 0))`` with the derivative of ``exp`` at 0, which ``jnp.minimum`` would halve."""
     return jnp.exp(jnp.where(x > 0, 0.0, x))
 
 
 def _weigh(predicted: Float[Array, " S"], factors: Float[Array, "S A"]) -> tuple[Array, Array, Array]:
-    """Joint of one step in linear scale, its sum, and the logarithm of the scale taken out."""
+    """Return the joint of one step in linear scale, its sum, and the logarithm of its scale."""
     possible = jnp.where(predicted[:, None] > 0, factors, -jnp.inf)
     scale = lax.stop_gradient(jnp.max(possible))
     scale = jnp.where(jnp.isfinite(scale), scale, 0.0)
@@ -188,13 +189,13 @@ def _forward(mdp: TabularMDP, factors: Float[Array, "L S A"], live: Bool[Array, 
         predicted, total, ratio = carry
         factor, alive = inputs
         joint, norm, scale = _weigh(predicted, factor)
-        # Constants to a derivative, which then is that of the last norm alone: quotients of small norms would
+        # Constant to a derivative, which then is that of the last norm alone: quotients of small norms would
         # leave the range of doubles.
         constant = lax.stop_gradient(norm)
         possible = constant > _TINY
         safe = jnp.where(possible, constant, 1.0)
         log_norm = jnp.where(possible, jnp.log(safe) + scale, -jnp.inf)
-        # Divided before it is pushed: a rare transition of what is small would be lost.
+        # Divided before the push: a rare transition from an unlikely state would be lost.
         following = jnp.where(possible, mdp.push_forward(joint / safe), 0.0)
         carry = (
             jnp.where(alive, following, predicted),
@@ -216,17 +217,17 @@ def _lost(
     predicted: Float[Array, "L S"],
     log_norms: Float[Array, " L"],
 ) -> Bool[Array, ""]:
-    """Say whether a forward pass may have lost a state to rounding that later evidence turns to."""
+    """Return whether a forward pass may have lost a state that later evidence favours."""
     rarest = jnp.min(jnp.where(predicted > 0, predicted, 1.0), 1)
     lowest = jnp.min(jnp.where(factors > -jnp.inf, factors, jnp.inf), (1, 2))
-    # The share of its step's probability that the least likely pair has, at least.
+    # Lower bound of the least likely pair's share of its step's probability.
     risky = live & (jnp.log(rarest) + lowest - log_norms < math.log(_SMALL))
     given = (mdp.initial, mdp.probabilities)
     rare = sum(jnp.any((x > 0) & (x < _SMALL)) for x in given) > 0
     before = jnp.cumsum(risky) - risky > 0
-    # However likely a lost state would have made the evidence, not by more than the best of the factors.
+    # A lost state raises the probability of the evidence by the best of the factors at most.
     short = jnp.where(live & (before | rare), jnp.max(factors, (1, 2)) - log_norms, 0.0)
-    # NaN, of factors that are none, is not repaired by logarithms.
+    # NaN in the factors is NaN in logarithms too.
     return jnp.sum(short) > _DISAPPOINTED
 
 
@@ -266,9 +267,9 @@ def _back(mdp: TabularMDP, step: Callable, *inputs: Array) -> Array:
 def _message(
     predicted: Float[Array, " S"], factors: Float[Array, "S A"], onward: Float[Array, "S A"]
 ) -> Float[Array, " S"]:
-    # Only states that can occur matter: the others' messages would grow without bound.
+    # Only states that can occur matter: messages of the others would grow without bound.
     message = jnp.where(predicted > 0, jnp.sum(_bounded_exp(factors) * onward, axis=1), 0.0)
-    # Their common scale drops out of the posterior.
+    # The common scale cancels in the posterior.
     return message / jnp.maximum(lax.stop_gradient(jnp.max(message)), _TINY)
 
 
@@ -282,12 +283,12 @@ def _shares(joint: Array) -> Array:
 
 
 def _log(x: Array) -> Array:
-    """Logarithm with ``log 0 = -inf`` and a zero, not NaN, gradient there."""
+    """Take the logarithm with ``log 0 = -inf`` and a zero, not NaN, gradient there."""
     return jnp.where(x > 0, jnp.log(jnp.where(x > 0, x, 1.0)), -jnp.inf)
 
 
 def _log_sum(logs: Array, axis: int | tuple[int, ...], weights: Array | float = 1.0) -> Array:
-    """``log sum weights exp(logs)``, ``-inf`` with a zero gradient for nothing."""
+    """Compute ``log sum weights exp(logs)``; ``-inf`` with a zero gradient for an empty sum."""
     top = lax.stop_gradient(jnp.max(jnp.where(weights > 0, logs, -jnp.inf), axis, keepdims=True))
     top = jnp.where(jnp.isfinite(top), top, 0.0)
     return _log(jnp.sum(weights * _bounded_exp(logs - top), axis)) + jnp.squeeze(top, axis)

@@ -1,8 +1,7 @@
-"""The declared model of a sensor that errs on features of a pair, in PyMC (Bayesian reading of chapter 6.1).
+"""The declared model of a sensor with noise on features of a pair, in PyMC (Bayesian chapter 6.1).
 
-Reliabilities have Beta priors; what is known of the reports of any number of sessions is on how many of them
-each predicate was that of the truth, how likely each truth was, and how sure perception was. Where truths are
-hidden, they are the expectations that a posterior over them gives.
+Reliabilities have Beta priors. The data of any number of sessions are the matches of each predicate, the
+weight of each hidden pair, and perception's scores. Hidden truths enter by their posterior expectations.
 """
 
 from __future__ import annotations
@@ -37,29 +36,29 @@ def observation_feature_model(
         p_j \sim \text{Beta}(a_j, b_j), \qquad
         \log P(\text{reports} \mid p) = \sum_j n_j \, \text{logit} \, p_j - \sum_g w_g \log Z_g(p)
 
-    with :math:`n_j` the matches of predicate :math:`j` and :math:`w_g` the reports whose truth was :math:`g`:
-    Eq. 6.5, normalised. Its maximum over logits is the maximum-entropy program's answer. Where every
-    combination of predicates is reportable and equally common, :math:`p_j` is also how often predicate
-    :math:`j` is right, and the posterior is ``Beta(a + matches, b + reports - matches)``.
+    with :math:`n_j` the matches of predicate :math:`j` and :math:`w_g` the observations whose truth was
+    :math:`g`: Eq. 6.5, normalised. Its maximum over logits is the solution of the maximum-entropy program. If
+    every combination of predicates is reportable and equally common, :math:`p_j` is also the frequency with
+    which predicate :math:`j` is right, and the posterior is ``Beta(a + matches, b + reports - matches)``.
 
-    A score ``c_t`` is perception's calibrated confidence that its report is right, in agreement with its
-    truth on every predicate. The model gives that the probability ``mu(p)``, averaged over truths, and hears
-    the expectation ``sum_t c_t log mu + (1 - c_t) log(1 - mu)``. It is greatest where ``mu`` is the mean
-    score, as Eq. 6.6 has it, however scores are spread.
+    A score ``c_t`` is perception's calibrated confidence that its observation is right, in agreement with the
+    truth on every predicate. The model gives this event the probability ``mu(p)``, averaged over truths, and
+    adds the expectation ``sum_t c_t log mu + (1 - c_t) log(1 - mu)``. Its maximum is at ``mu`` equal to the
+    mean score, as in Eq. 6.6, however scores are spread.
 
     Parameters
     ----------
     predicates : bool or int ``[J, S, A]``
     reported : ReportedMatches
-        Of all sessions so far; their counts add up.
+        Counts of all sessions so far; they add up.
     scores : float ``[n]``, optional
-        In [0, 1]; NaN where perception gave none. Without scores ``score`` is not in the model.
+        In [0, 1]; NaN where perception gave none. Without scores the model has no ``score``.
     reportable : bool ``[S, A]``, optional
-        Which pairs perception may report; all by default.
+        Pairs that perception may report; all by default.
     prior : pair of float or float ``[J]``
         ``a`` and ``b``; uniform by default.
     names : tuple of str, optional
-        Of the predicates, the coordinate ``predicate``; ``psi1``, ``psi2``, ... by default.
+        Names of the predicates, the coordinate ``predicate``; ``psi1``, ``psi2``, ... by default.
 
     Returns
     -------
@@ -71,8 +70,8 @@ def observation_feature_model(
     Raises
     ------
     ValueError
-        For bad predicates, matches that do not fit the reports, scores outside [0, 1], a prior that is not
-        positive, and another number of names than of predicates.
+        For bad predicates, matches that do not fit the observations, scores outside [0, 1], a prior that is
+        not positive, and another number of names than of predicates.
     """
     classes = predicate_classes(predicates, reportable)
     n_predicates = classes.vectors.shape[1]
@@ -82,7 +81,7 @@ def observation_feature_model(
     known = _checked_scores(scores)
     said = classes.reportable > 0
     agree, log_count = classes.agreements[:, said], np.log(classes.reportable[said])
-    # Reports in the truth's own class are those that agree on everything.
+    # Observations in the truth's own class agree on every predicate.
     own = np.where(said, np.log(np.maximum(classes.reportable, 1.0)), -np.inf)
     coords: dict[str, Any] = {"predicate": list(names)}
     if len(known):
@@ -133,9 +132,9 @@ def sample_observation_features(
     ----------
     key : JAX random key
     predicates, reported, **model
-        Of the model.
+        Arguments of the model.
     draws, warmup, chains : int
-        Draws kept and discarded by each chain, and number of chains.
+        Draws returned and discarded by each chain, and number of chains.
     target_accept : float
         As in PyMC.
 
@@ -152,7 +151,7 @@ def sample_observation_features(
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")
     with warnings.catch_warnings(), observation_feature_model(predicates, reported, **model):
-        # JAX compiles all of this: what PyTensor's own compiler would want to link to does not matter.
+        # JAX compiles everything, so the libraries of PyTensor's own compiler do not matter.
         warnings.filterwarnings("ignore", message="PyTensor could not link to a BLAS")
         return pm.sample(
             draws,
@@ -207,7 +206,7 @@ def _checked_names(names: tuple[str, ...] | None, n_predicates: int) -> tuple[st
 
 
 def _checked_scores(scores: ArrayLike | None) -> Float[np.ndarray, " n"]:
-    """Scores that were given."""
+    """Check scores and drop missing ones."""
     c = np.zeros(0) if scores is None else np.asarray(scores, float)
     if c.ndim != 1:
         raise ValueError(f"scores have shape [n], one for each report, got {list(c.shape)}")

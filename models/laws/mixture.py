@@ -1,8 +1,8 @@
-"""The declared model of several ways of doing a task, jumbled in one demonstration (Bayesian chapter 5).
+"""The declared mixture model of a demonstration with several reward functions (Bayesian chapter 5).
 
-A Dirichlet process over reward weights by truncated stick-breaking (Ishwaran and James 2001). Which way each
-trajectory was done and what was hidden of it are both summed out, so what remains is a density that any
-NumPyro inference can take, and trajectories that are hidden in places are clustered with the others.
+A Dirichlet process over reward weights by truncated stick-breaking (Ishwaran and James 2001). The component
+of each trajectory and its hidden steps are both summed out. The result is a density for any NumPyro
+inference, and partly hidden trajectories are assigned together with the others.
 """
 
 from __future__ import annotations
@@ -41,16 +41,16 @@ COMPONENTS = 10
 
 @shown_briefly
 class Perceived(NamedTuple):
-    """Trajectories prepared for many evaluations of a mixture: what no weights change is computed once.
+    """Trajectories prepared for many evaluations of a mixture: quantities without weights are computed once.
 
     ``m`` fully seen trajectories, whose log-likelihood is ``counts . log_policy + dynamics``, then ``h``
-    others, which take a forward pass. ``repeats`` says how often each was perceived (0 for spare rows).
+    others, which take a forward pass. ``repeats`` counts each trajectory's observations (0 for spare rows).
 
     Fields
     ------
     counts : float ``[m, S, A]``
     dynamics : float ``[m]``
-        Log-probability of the states and of being seen, given the actions.
+        Log-probability of the states and of seeing them, given the actions.
     log_evidence : float ``[h, L, S, A]``
     live : bool ``[h, L]``
     repeats : int ``[m + h]``
@@ -64,7 +64,7 @@ class Perceived(NamedTuple):
 
 
 def as_evidence(mdp: TabularMDP, sensor: AnySensor, codes: Int[Array, "n L 3"]) -> Perceived:
-    """Every trajectory as one that takes a forward pass; traceable."""
+    """Prepare every trajectory for a forward pass; traceable."""
     shape = (mdp.n_states, mdp.n_actions)
 
     def step(code: Int[Array, " 3"]) -> Float[Array, "S A"]:
@@ -82,9 +82,9 @@ _as_evidence = jax.jit(as_evidence)
 def perceive(
     mdp: TabularMDP, sensor: AnySensor, codes: Int[np.ndarray, "n L 3"]
 ) -> tuple[Perceived, Int[np.ndarray, " n"]]:
-    """Gather identical trajectories and tell fully seen ones from others; and each trajectory's row.
+    """Gather identical trajectories and separate fully seen ones; also return each trajectory's row.
 
-    Both parts are padded to a multiple of eight, so that growing demonstrations meet few shapes. Not
+    Both parts are padded to a multiple of eight, so that growing demonstrations have few shapes. Not
     traceable.
     """
     sensor, codes = fitting_sensor(sensor, mdp), np.asarray(checked_codes(mdp, codes))
@@ -133,23 +133,23 @@ _dynamics = jax.jit(_passes)
 def trajectory_log_likelihoods(
     mdp: TabularMDP, log_policy: Float[Array, "S A"], perceived: Perceived
 ) -> Float[Array, " u"]:
-    """Log-likelihood of each trajectory under one policy, hidden steps summed out."""
+    """Return the log-likelihood of each trajectory under one policy, hidden steps summed out."""
     return component_log_likelihoods(mdp, log_policy[None], perceived)[0]
 
 
 def soft_policies(mdp: TabularMDP, weights: Float[Array, "T K"]) -> Float[Array, "T S A"]:
-    """Log-policy of the soft plan of each row of weights."""
+    """Return the log-policy of the soft plan of each row of weights."""
     return lax.map(lambda w: soft_plan(mdp, reward_of(mdp, w)).log_policy, weights)
 
 
 def component_log_likelihoods(
     mdp: TabularMDP, log_policies: Float[Array, "T S A"], perceived: Perceived
 ) -> Float[Array, "T u"]:
-    """Log-likelihood of each trajectory under each policy."""
-    # An unavailable action has log-probability -inf, which zero visits must not turn into NaN.
+    """Return the log-likelihood of each trajectory under each policy."""
+    # An unavailable action has log-probability -inf; times zero visits it would be NaN.
     finite = jnp.where(mdp.available, log_policies, 0.0)
     seen = jnp.einsum("msa,tsa->tm", perceived.counts, finite) + perceived.dynamics
-    # All passes of all policies at once: mapped over policies, each would be made in logarithms too.
+    # All passes of all policies in one call: a map over policies would add passes in logarithms.
     factors = perceived.log_evidence + log_policies[:, None, None]
     live = jnp.tile(perceived.live, (len(factors), 1))
     passed = _passes(mdp, factors.reshape(-1, *factors.shape[2:]), live)
@@ -157,36 +157,36 @@ def component_log_likelihoods(
 
 
 def stick_proportions(sticks: Float[Array, " T-1"]) -> Float[Array, " T"]:
-    r"""Mixture proportions :math:`\pi_d = v_d \prod_{j<d} (1 - v_j)`, the last taking what is left."""
+    r"""Return mixture proportions :math:`\pi_d = v_d \prod_{j<d} (1 - v_j)`; the last takes the rest."""
     ones = jnp.ones(1)
     return jnp.concatenate([sticks, ones]) * jnp.concatenate([ones, jnp.cumprod(1 - sticks)])
 
 
 def truncation_error(n_trajectories: int, components: int, concentration: float) -> float:
-    r"""Most by which truncation changes the law of a demonstration, :math:`4 n (\alpha/(1+\alpha))^{T-1}`.
+    r"""Bound the effect of truncation on a demonstration's law, :math:`4 n (\alpha/(1+\alpha))^{T-1}`.
 
-    In the integral of the absolute difference of densities, so at most 2. From Ishwaran and James (2001,
-    Theorem 2), :math:`4 (1 - E(1 - R)^n)` with ``R`` the stick that ``T - 1`` breaks leave, by Bernoulli's
-    inequality; their closing :math:`4 n e^{-(T-1)/\alpha}` replaces ``E R`` by ``exp(E log R)``, which is
-    smaller, and is no bound where ``alpha`` is small.
+    The effect is the integral of the absolute difference of densities, hence at most 2. Ishwaran and James
+    (2001, Theorem 2) give :math:`4 (1 - E(1 - R)^n)` with ``R`` the rest after ``T - 1`` breaks; Bernoulli's
+    inequality gives the bound. Their closing :math:`4 n e^{-(T-1)/\alpha}` replaces ``E R`` by the smaller
+    ``exp(E log R)`` and fails as a bound for small ``alpha``.
     """
     return min(2.0, 4.0 * n_trajectories * (concentration / (1 + concentration)) ** (components - 1))
 
 
 class MixtureLaw(dist.Distribution):
-    """What a sensor perceives of ``length`` steps of an expert who does the task in one of several ways.
+    """Law of the observations of ``length`` steps of an expert with one of several reward functions.
 
     A mixture of :class:`TrajectoryLaw`, one for each row of weights, with the same values. ``log_prob`` sums
-    out the way and the hidden steps exactly; ``sample`` draws a way, simulates, and perceives.
+    out the component and the hidden steps exactly; ``sample`` draws a component, simulates, and observes.
 
     Parameters
     ----------
     mdp : TabularMDP
     proportions : float ``[..., T]``
-        How likely each way is; leading dimensions are the batch.
+        Probability of each component; leading dimensions are the batch.
     weights : float ``[T, K]``
-        Reward weights of each way.
-    sensor : Imperfection
+        Reward weights of each component.
+    sensor : Sensor
     length : int
         Steps of an event, ``L``.
 
@@ -221,11 +221,11 @@ class MixtureLaw(dist.Distribution):
 
     @property
     def support(self) -> constraints.Constraint:
-        """Integer codes of known kinds, states and actions."""
+        """Constraint: integer codes of known kinds, states and actions."""
         return CodesConstraint(self.mdp.n_states, self.mdp.n_actions)
 
     def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Int[Array, "... L 3"]:
-        """Simulate what would be perceived."""
+        """Simulate observations."""
 
         def one(key: Array, log_proportions: Float[Array, " T"]) -> Int[Array, "L 3"]:
             choose, act, look = jax.random.split(key, 3)
@@ -240,7 +240,7 @@ class MixtureLaw(dist.Distribution):
 
     @validate_sample
     def log_prob(self, value: Int[Array, "... L 3"]) -> Float[Array, "..."]:
-        """Exact log-probability of what was perceived; ways and hidden steps summed out."""
+        """Return the exact log-probability of observations; components and hidden steps summed out."""
         value = checked_codes(self.mdp, value)
         if value.shape[-2:] != (self.length, 3):
             raise ValueError(f"a value has shape [..., {self.length}, 3], got {value.shape}")
@@ -252,9 +252,10 @@ class MixtureLaw(dist.Distribution):
 def concentration_prior(
     concentration: float | Float[Array, ""] | dist.Distribution,
 ) -> Float[Array, ""] | dist.Distribution:
-    """A concentration as an array, or the prior of a random one, checked.
+    """Check a concentration; return a number as an array, or its prior as it is.
 
-    Raises ``ValueError`` for a number that is not positive and for a prior that is not over one positive one.
+    Raises ``ValueError`` for a number that is not positive and for a prior that is not over one positive
+    number.
     """
     if isinstance(concentration, dist.Distribution):
         shape = (*concentration.batch_shape, *concentration.event_shape)
@@ -281,37 +282,37 @@ def mixture_model(
     n_trajectories: int | None = None,
     length: int | None = None,
 ) -> Int[Array, "n L 3"] | None:
-    r"""NumPyro model of a demonstration in which trajectories were done in different ways.
+    r"""Define the NumPyro model of a demonstration whose trajectories have different reward functions.
 
     .. math::
         v_d \sim \text{Beta}(1, \alpha), \; d < T, \qquad \theta_d \sim \text{prior}, \; d \le T, \qquad
         Y_i \sim \sum_d \pi_d \, \text{TrajectoryLaw}(\theta_d), \; i \le n
 
-    with :math:`\pi` as in :func:`stick_proportions`. Two trajectories were done the same way with prior
-    probability ``1 / (1 + alpha)``, but for truncation (:func:`truncation_error`).
+    with :math:`\pi` as in :func:`stick_proportions`. Two trajectories have the same component with prior
+    probability ``1 / (1 + alpha)``, up to truncation (:func:`truncation_error`).
 
     Parameters
     ----------
     mdp, sensor
-        The decision process and how it is perceived.
+        The decision process and its sensor.
     codes : int ``[n, L, 3]`` or Perceived, optional
-        What was perceived, :attr:`Demonstration.codes`; :func:`perceive` prepares it for many evaluations of
-        the same density. Without it the model simulates, as :func:`occlusion_model` does, and says which way
-        each trajectory was done.
+        Observations, :attr:`Demonstration.codes`; :func:`perceive` prepares them for many evaluations of the
+        same density. Without them the model simulates, as :func:`occlusion_model` does, and also returns the
+        component of each trajectory.
     components : int
-        ``T``: the most ways that the model can tell apart.
+        ``T``: the largest number of components.
     concentration : float or Distribution
-        ``alpha``, or its prior (``Gamma(2, 2)``, say): the larger, the more ways.
+        ``alpha``, or its prior (``Gamma(2, 2)``, say): the larger, the more components.
     prior : Distribution, optional
-        Of each way's scaled weights, see :func:`~i2rl.models.weights_prior`.
+        Prior of each component's scaled weights, see :func:`~i2rl.models.weights_prior`.
     n_trajectories, length : int, optional
         ``n`` and ``L``, needed only without ``codes``.
 
     Returns
     -------
-    The site ``demonstration`` (None where it was prepared). Other sites: ``weights [T, K]``,
-    ``sticks [T - 1]`` (where ``T > 1``), deterministic ``proportions [T]``, ``concentration`` if it is
-    random, and ``assignment [n]`` when simulating.
+    The site ``demonstration`` (None if it was prepared). Other sites: ``weights [T, K]``,
+    ``sticks [T - 1]`` (if ``T > 1``), deterministic ``proportions [T]``, ``concentration`` if it is
+    random, and ``assignment [n]`` in simulations.
     """
     if components < 1:
         raise ValueError(f"a mixture needs at least one component, got {components}")

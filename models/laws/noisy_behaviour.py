@@ -1,9 +1,9 @@
-"""The declared model of an expert perceived through unknown noise: weights and reliabilities together.
+"""The declared model of an expert observed with unknown noise: weights and reliabilities together.
 
 The dissertation estimates the sensor, then the reward, and has no posterior over either. Here both have
-priors, demonstrations follow :class:`TrajectoryLaw`, and the truth behind every report is summed out, so that
-what remains is a density over ``R^(K + J)`` that any NumPyro inference can take. What a sloppy expert and a
-sloppy sensor both explain stays undecided in it.
+priors, demonstrations follow :class:`TrajectoryLaw`, and the truth behind every observation is summed out.
+The result is a density over ``R^(K + J)`` for any NumPyro inference. The posterior stays wide where expert
+noise and sensor noise explain the data equally well.
 """
 
 from __future__ import annotations
@@ -22,17 +22,17 @@ from .trajectory import TrajectoryLaw
 
 
 def reliabilities_prior(n_predicates: int, prior: dist.Distribution | None = None) -> dist.Distribution:
-    """The prior on reliabilities as one distribution with event shape ``[J]``.
+    """Build the prior on reliabilities as one distribution with event shape ``[J]``.
 
-    ``None`` is ``Beta(4, 1)``: perception is right four times in five, and in fifteen cases of sixteen more
-    often right than wrong. A distribution over a scalar stands for itself, independently for each predicate;
-    one over ``J`` numbers is taken as it is. Raises ``ValueError`` for any other shape, and for a prior that
+    ``None`` is ``Beta(4, 1)``: perception is right four times in five on average, and more often right than
+    wrong with probability 15/16. A distribution over a scalar applies independently to each predicate; one
+    over ``J`` numbers is returned as it is. Raises ``ValueError`` for any other shape, and for a prior that
     admits numbers outside (0, 1).
 
-    Under a prior that does not change when ``p`` becomes ``1 - p``, such as the uniform ``Beta(1, 1)``,
-    reports that are mostly wrong, of an expert whose weights have the other sign, may explain as much as
-    reports that are mostly right of the expert there is. This mirrored mode is far from the other, and
-    samplers that walk seldom cross over: ask for such a prior only where perception may be worse than chance.
+    A prior that is symmetric in ``p`` and ``1 - p``, such as the uniform ``Beta(1, 1)``, may have a mirrored
+    mode: mostly wrong observations of an expert whose weights have the opposite sign explain as much as
+    mostly right observations of the true expert. The mirrored mode is far away, and local samplers seldom
+    reach it. Use such a prior only if perception may be worse than chance.
     """
     if prior is None:
         prior = dist.Beta(4.0, 1.0)
@@ -66,7 +66,7 @@ def noisy_behaviour_model(
     reliability_prior: dist.Distribution | None = None,
     repeats: Int[Array, " n"] | None = None,
 ) -> Int[Array, "n L 3"]:
-    r"""NumPyro model of demonstrations seen through :class:`FeatureNoise` of unknown reliabilities.
+    r"""Define the NumPyro model of demonstrations under :class:`FeatureNoise` of unknown reliabilities.
 
     .. math::
         \theta \sim \text{prior}, \qquad p \sim \text{reliability prior}, \qquad
@@ -78,25 +78,27 @@ def noisy_behaviour_model(
     predicates : bool or int ``[J, S, A]``
         Labels such as the state's index included, as in ``FeatureNoise``.
     codes : int ``[n, L, 3]``, optional
-        What was perceived, :attr:`Demonstration.codes` (scores are not part of the event). Without it the
-        model simulates, as :func:`occlusion_model` does.
-    view : Imperfection, optional
-        What hides steps besides, :class:`Visibility`; nothing by default.
+        Observations, :attr:`Demonstration.codes` (scores are not part of the event). Without them the model
+        simulates, as :func:`occlusion_model` does.
+    view : Sensor, optional
+        A :class:`Visibility` that hides steps besides; none by default.
     reportable : bool ``[S, A]``, optional
         As in ``FeatureNoise``.
     n_trajectories, length : int, optional
         ``n`` and ``L``, needed only without ``codes``.
     prior, reliability_prior : Distribution, optional
-        Of the scaled weights, see :func:`~i2rl.models.weights_prior`, and :func:`reliabilities_prior`.
+        Priors of the scaled weights, see :func:`~i2rl.models.weights_prior`, and of
+        :func:`reliabilities_prior`.
     repeats : int ``[n]``, optional
-        How many times each row of ``codes`` was perceived, if identical trajectories were gathered.
+        Count of each row of ``codes``, if identical trajectories were gathered.
 
     Returns
     -------
     The site ``demonstration``; the others are ``weights [K]`` and ``reliabilities [J]``, the plate is
     ``trajectory``.
 
-    Raises ``ValueError`` for predicates, views and priors that do not fit, and as ``TrajectoryLaw`` does.
+    Raises ``ValueError`` for predicates, visibilities and priors that do not fit, and as ``TrajectoryLaw``
+    does.
     """
     if codes is not None:
         n_trajectories, length = codes.shape[0], codes.shape[1]

@@ -1,7 +1,7 @@
-"""The declared model of an expert watched through an imperfect sensor (Bayesian reading of chapter 4).
+"""The declared model of an expert observed by a sensor (Bayesian chapter 4).
 
-Weights have a prior, demonstrations follow :class:`TrajectoryLaw`, and hidden steps are summed out, so what
-remains is a density over ``R^K`` that any NumPyro inference can take.
+Weights have a prior, demonstrations follow :class:`TrajectoryLaw`, and hidden steps are summed out. The
+result is a density over ``R^K`` for any NumPyro inference.
 """
 
 from __future__ import annotations
@@ -21,20 +21,20 @@ from ..process.mdp import TabularMDP
 from ..process.units import feature_scale
 from .trajectory import TrajectoryLaw
 
-# A scaled weight is a log-odds of at most that size, as in logistic regression with standardised inputs, and
-# 2.5 is that model's customary weakly informative scale: it admits experts who err once in hundreds of
-# choices, not infinitely sure ones.
+# A scaled weight is a log-odds of at most that size, as in logistic regression with standardised inputs.
+# There 2.5 is the customary weakly informative scale: it admits experts who err once in hundreds of choices,
+# and excludes almost certain ones.
 PRIOR_SCALE = 2.5
 
 
 def weights_prior(n_features: int, prior: dist.Distribution | None = None) -> dist.Distribution:
-    """The prior on scaled weights as one distribution with event shape ``[K]``.
+    """Build the prior on scaled weights as one distribution with event shape ``[K]``.
 
     A scaled weight is the reward in nats that a feature adds at most (:mod:`~i2rl.models.process.units`).
-    ``None`` is ``Normal(0, PRIOR_SCALE)`` for each feature; a distribution over a scalar stands for itself,
-    independently for each feature (``Laplace(0, 1 / beta)`` is the prior whose mode meets the L1 penalty of
-    the relaxed maximum-entropy program); one over ``K`` numbers is taken as it is. Raises ``ValueError`` for
-    any other shape.
+    ``None`` is ``Normal(0, PRIOR_SCALE)`` for each feature. A distribution over a scalar applies
+    independently to each feature (``Laplace(0, 1 / beta)`` has its mode at the L1 penalty of the relaxed
+    maximum-entropy program); one over ``K`` numbers is returned as it is. Raises ``ValueError`` for any other
+    shape.
     """
     if prior is None:
         prior = dist.Normal(0.0, PRIOR_SCALE)
@@ -50,7 +50,7 @@ def weights_prior(n_features: int, prior: dist.Distribution | None = None) -> di
 
 
 class _Scaled(constraints.Constraint[Any]):
-    """Weights that times ``scale`` meet ``base``."""
+    """Constraint on weights whose product with ``scale`` meets ``base``."""
 
     def __init__(self, base: constraints.Constraint, scale: Float[Array, " K"]) -> None:
         self.base, self.scale = base, scale
@@ -71,7 +71,7 @@ class _Scaled(constraints.Constraint[Any]):
 
 @dist.biject_to.register(_Scaled)
 def _to_scaled(constraint: _Scaled) -> Transform:
-    # Samplers so move in scaled weights, whatever the units.
+    # Samplers thereby move in scaled weights, whatever the units.
     unscale = AffineTransform(0.0, 1 / constraint.scale)
     return ComposeTransform([dist.biject_to(constraint.base), unscale])
 
@@ -88,7 +88,7 @@ class ScaledPrior(dist.Distribution):
 
     @property
     def support(self) -> constraints.Constraint:
-        """Weights whose scaled form is in the base's support."""
+        """Constraint: weights whose scaled form is in the base's support."""
         return _Scaled(self.base.support, self.scale)
 
     def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Float[Array, "... K"]:
@@ -96,12 +96,12 @@ class ScaledPrior(dist.Distribution):
         return self.base.sample(key, sample_shape) / self.scale
 
     def log_prob(self, value: Float[Array, "... K"]) -> Float[Array, "..."]:
-        """Log-density of weights."""
+        """Return the log-density of weights."""
         return self.base.log_prob(value * self.scale) + jnp.sum(jnp.log(self.scale))
 
 
 def scaled_prior(mdp: TabularMDP, prior: dist.Distribution | None = None) -> ScaledPrior:
-    """The law of ``mdp``'s weights under a prior on scaled weights; see :func:`weights_prior`."""
+    """Build the law of ``mdp``'s weights under a prior on scaled weights; see :func:`weights_prior`."""
     if isinstance(prior, ScaledPrior):
         return prior
     return ScaledPrior(weights_prior(mdp.n_features, prior), feature_scale(mdp))
@@ -117,25 +117,25 @@ def occlusion_model(
     prior: dist.Distribution | None = None,
     repeats: Int[Array, " n"] | None = None,
 ) -> Int[Array, "n L 3"]:
-    r"""NumPyro model of demonstrations seen through ``sensor``.
+    r"""Define the NumPyro model of demonstrations seen through ``sensor``.
 
     .. math:: \theta \sim \text{prior}, \qquad Y_i \mid \theta \sim \text{TrajectoryLaw}(\theta), \; i < n
 
     Parameters
     ----------
     mdp, sensor
-        The decision process and how it is perceived.
+        The decision process and its sensor.
     codes : int ``[n, L, 3]``, optional
-        What was perceived, :attr:`Demonstration.codes` (scores are not part of the event). Without it the
+        Observations, :attr:`Demonstration.codes` (scores are not part of the event). Without them the
         model simulates: ``Predictive(occlusion_model, num_samples=100)(key, mdp, sensor,
         n_trajectories=20, length=5)`` is the prior predictive.
     n_trajectories, length : int, optional
         ``n`` and ``L``, needed only without ``codes``.
     prior : Distribution, optional
-        Of the scaled weights, see :func:`weights_prior`.
+        Prior of the scaled weights, see :func:`weights_prior`.
     repeats : int ``[n]``, optional
-        How many times each row of ``codes`` was perceived, if identical trajectories were gathered: they
-        have one likelihood, so this is the same model at less cost.
+        Count of each row of ``codes``, if identical trajectories were gathered; they share one likelihood,
+        so this is the same model at less cost.
 
     Returns
     -------

@@ -49,26 +49,26 @@ class CodesConstraint(constraints.Constraint):
 
 
 class TrajectoryLaw(dist.Distribution):
-    """What a sensor perceives of ``length`` steps of an expert who follows ``theta . phi``'s soft policy.
+    """Law of the observations of ``length`` steps of an expert with ``theta . phi``'s soft policy.
 
     A value is an integer array ``[..., L, 3]`` of (kind, state, action), as in
     :attr:`Demonstration.codes`; trajectories shorter than ``length`` are padded. ``log_prob`` is exact:
     hidden steps, lost frames and noise are summed out by one forward pass, and it is differentiable in the
-    weights. ``sample`` simulates the expert and passes the trajectory through the sensor (it never loses
-    frames: those say nothing about the expert).
+    weights. ``sample`` simulates the expert and passes the trajectory through the sensor (without lost
+    frames, which carry no evidence).
 
     Parameters
     ----------
     mdp : TabularMDP
     weights : float ``[K]`` (``theta``)
-    sensor : Imperfection
-        What is hidden and what is noisy; ``Sensor()`` sees everything.
+    sensor : Sensor
+        Visibility and noise; ``Sensor()`` sees everything.
     length : int
         Steps of an event, ``L``.
 
     Raises ``ValueError`` for discount 1, for a sensor made for another MDP, and for values of another
-    length; ``log_prob`` raises :class:`DemonstrationError` for a value that names no state or action, unless
-    JAX traces it: then its log-probability is minus infinity.
+    length; ``log_prob`` raises :class:`DemonstrationError` for a value with an index out of range. For a
+    traced value it returns minus infinity instead.
     """
 
     arg_constraints = {"weights": constraints.real_vector}  # noqa: RUF012
@@ -92,11 +92,11 @@ class TrajectoryLaw(dist.Distribution):
 
     @property
     def support(self) -> constraints.Constraint:
-        """Integer codes of known kinds, states and actions."""
+        """Constraint: integer codes of known kinds, states and actions."""
         return CodesConstraint(self.mdp.n_states, self.mdp.n_actions)
 
     def sample(self, key: Array, sample_shape: tuple[int, ...] = ()) -> Int[Array, "... L 3"]:
-        """Simulate what would be perceived."""
+        """Simulate observations."""
 
         def one(key: Array) -> Int[Array, "L 3"]:
             act, look = jax.random.split(key)
@@ -111,7 +111,7 @@ class TrajectoryLaw(dist.Distribution):
 
     @validate_sample
     def log_prob(self, value: Int[Array, "... L 3"]) -> Float[Array, "..."]:
-        """Exact log-probability of what was perceived, hidden steps summed out."""
+        """Return the exact log-probability of observations, hidden steps summed out."""
 
         def evidence(code: Int[Array, " 3"]) -> Float[Array, "S A"]:
             shape = (self.mdp.n_states, self.mdp.n_actions)

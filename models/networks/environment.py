@@ -1,7 +1,7 @@
-"""Tasks to act in: what a generator of behaviour needs to know of one, and what it brings back.
+"""Tasks for a generator of behaviour: their protocol, and the rollouts they return.
 
-Two kinds. An :class:`Environment` is pure JAX functions, so that a whole rollout compiles; a
-:class:`HostEnvironment` steps a batch at a time in NumPy, as a physics engine does.
+A task is of one of two kinds. An :class:`Environment` is pure JAX functions, so that a whole rollout
+compiles; a :class:`HostEnvironment` steps a batch at a time in NumPy, as a physics engine does.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ class Environment(NamedTuple):
     ------
     name : str
     observation_size : int
-    low, high : tuples of ``observation_size`` floats, bounds of an observation (infinite where there is none)
+    low, high : tuples of ``observation_size`` floats, bounds of an observation (infinite if there is none)
     actions : ActionSpace
-    horizon : int, steps after which an episode is cut off (a truncation, not a termination)
+    horizon : int, steps after which an episode is truncated (not terminated)
     reset : ``(key) -> state``, a first state drawn
     step : ``(state, action) -> (state, reward, terminated)``
     observe : ``(state) -> observation [d]``, 32-bit floats
     next_state : ``(observation [..., d], action) -> observation [..., d]``, the dynamics alone, in the
-        coordinates of an observation and in the precision they are given in
-    settings : pairs that tell it from others of its name, for a journal
+        coordinates of an observation and in the precision of its argument
+    settings : pairs that distinguish it from others of its name, for a journal
     """
 
     name: str
@@ -50,14 +50,14 @@ class Environment(NamedTuple):
 
 
 class HostEnvironment(Protocol):
-    """A task stepped in NumPy, many episodes at a time. Actions beyond the bounds are cut to them.
+    """A task stepped in NumPy, many episodes at a time. Actions are clipped to the bounds.
 
     It may have ``settings`` as an :class:`Environment` does.
     """
 
     @property
     def name(self) -> str:
-        """What it is called."""
+        """Name of the task."""
         ...
 
     @property
@@ -67,39 +67,39 @@ class HostEnvironment(Protocol):
 
     @property
     def actions(self) -> ActionSpace:
-        """What can be done."""
+        """Space of actions."""
         ...
 
     @property
     def horizon(self) -> int:
-        """Steps after which an episode is cut off."""
+        """Steps after which an episode is truncated."""
         ...
 
     def reset(self, key: Array, n: int) -> np.ndarray:
-        """First states ``[n, D]``, drawn."""
+        """Draw first states ``[n, D]``."""
         ...
 
     def step(self, states: np.ndarray, actions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """States ``[n, D]``, rewards ``[n]`` and whether each terminated ``[n]``, after one step."""
+        """Advance one step; return states ``[n, D]``, rewards ``[n]`` and terminations ``[n]``."""
         ...
 
     def observe(self, states: np.ndarray) -> np.ndarray:
-        """Observations ``[n, d]``."""
+        """Return observations ``[n, d]``."""
         ...
 
 
 @shown_briefly
 class Rollout(NamedTuple):
-    """``T`` steps of ``n`` episodes side by side, new ones beginning where old ones end.
+    """``T`` steps of ``n`` episodes side by side; new ones begin where old ones end.
 
     Fields
     ------
     observations : float32 ``[T, n, d]``
-    actions : int32 ``[T, n]``, or float32 ``[T, n, k]`` as drawn, before they are cut to the bounds
+    actions : int32 ``[T, n]``, or float32 ``[T, n, k]`` as drawn, before clipping
     next_observations : float32 ``[T, n, d]``, the true successors, also of an episode's last step
     rewards : float32 ``[T, n]``, the environment's own
-    terminated : bool ``[T, n]``, whether the task ended here
-    truncated : bool ``[T, n]``, whether only the time ran out here
+    terminated : bool ``[T, n]``, True if the task ended here
+    truncated : bool ``[T, n]``, True if only the time ran out here
     log_probs : float32 ``[T, n]``, of the actions under the policy that drew them
     values : float32 ``[T, n]``, the critic's, of the observations
     """
@@ -114,5 +114,5 @@ class Rollout(NamedTuple):
     values: Float[Array, "T n"]
 
     def flat(self) -> Rollout:
-        """All steps in one row, ``[T * n, ...]``."""
+        """Flatten all steps into one row, ``[T * n, ...]``."""
         return jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), self)

@@ -1,7 +1,7 @@
-"""Rewards and policies as networks: what is learned where nobody has engineered features (chapter 6.2).
+"""Rewards and policies as networks, for tasks without engineered features (chapter 6.2).
 
-Modules of Equinox whose leaves are arrays and nothing else, so that they are carried, journalled and compared
-like any other state. All take batches, ``[..., d]``, and compute in 32-bit floats.
+Modules of Equinox whose leaves are arrays only, so that they are carried, journalled and compared like any
+other state. All take batches, ``[..., d]``, and compute in 32-bit floats.
 """
 
 from __future__ import annotations
@@ -36,22 +36,22 @@ class ActionSpace(NamedTuple):
 
     @property
     def discrete(self) -> bool:
-        """Whether there are finitely many."""
+        """True if there are finitely many actions."""
         return self.n > 0
 
     @property
     def size(self) -> int:
-        """Length of an action given to a network: one-hot, or the vector itself."""
+        """Length of an action as a network's input: one-hot, or the vector itself."""
         return self.n if self.discrete else len(self.low)
 
     def encode(self, actions: ArrayLike) -> Float[Array, "... size"]:
-        """Actions as a network takes them."""
+        """Encode actions as inputs of a network."""
         if self.discrete:
             return jax.nn.one_hot(jnp.asarray(actions), self.n, dtype=DTYPE)
         return jnp.asarray(actions, DTYPE)
 
     def clip(self, actions: Float[Array, "... k"]) -> Float[Array, "... k"]:
-        """Vectors within the bounds; discrete actions as they are."""
+        """Clip vectors to the bounds; discrete actions are unchanged."""
         if self.discrete:
             return actions
         return jnp.clip(actions, jnp.asarray(self.low, DTYPE), jnp.asarray(self.high, DTYPE))
@@ -62,7 +62,7 @@ class MLP(eqx.Module):
 
     Fields
     ------
-    weights, biases : arrays ``[in, out]`` and ``[out]``, one a layer
+    weights, biases : arrays ``[in, out]`` and ``[out]``, one per layer
     """
 
     weights: tuple[Float[Array, "in out"], ...]
@@ -78,7 +78,7 @@ class MLP(eqx.Module):
         scale: float = 2.0**0.5,
         last: float = 1.0,
     ) -> MLP:
-        """Orthogonal weights times ``scale`` (the last layer's times ``last``), biases zero.
+        """Create orthogonal weights times ``scale`` (the last layer's times ``last``), and zero biases.
 
         ``sizes`` counts input, hidden layers and output. Raises ``ValueError`` for another activation.
         """
@@ -93,7 +93,7 @@ class MLP(eqx.Module):
         return MLP(weights, tuple(jnp.zeros(o, DTYPE) for o in sizes[1:]), activation)
 
     def __call__(self, x: Float[Array, "... in"]) -> Float[Array, "... out"]:
-        """Outputs of a batch."""
+        """Return the outputs of a batch."""
         between = jnp.tanh if self.activation == "tanh" else jax.nn.relu
         for w, b in zip(self.weights[:-1], self.biases[:-1], strict=True):
             x = between(x @ w + b)
@@ -101,11 +101,11 @@ class MLP(eqx.Module):
 
 
 class RunningNorm(eqx.Module):
-    """Inputs scaled by the mean and deviation of all inputs so far (Chan, Golub and LeVeque 1983).
+    """Scaling by the mean and deviation of all inputs so far (Chan, Golub and LeVeque 1983).
 
     Fields
     ------
-    count : float, how many inputs
+    count : float, number of inputs
     mean : float ``[d]``
     scatter : float ``[d]``, the sum of squared deviations from the mean
     """
@@ -116,11 +116,11 @@ class RunningNorm(eqx.Module):
 
     @staticmethod
     def create(size: int) -> RunningNorm:
-        """Before any input: the identity."""
+        """Create the identity, before any input."""
         return RunningNorm(jnp.zeros((), DTYPE), jnp.zeros(size, DTYPE), jnp.zeros(size, DTYPE))
 
     def update(self, x: Float[Array, "... d"]) -> RunningNorm:
-        """With a batch of inputs taken in."""
+        """Add a batch of inputs to the statistic."""
         flat = jnp.asarray(x, DTYPE).reshape(-1, x.shape[-1])
         n, mean = flat.shape[0], flat.mean(0)
         total = self.count + n
@@ -138,7 +138,7 @@ class RunningNorm(eqx.Module):
         return jnp.where(self.count > 1, jnp.sqrt(variance + 1e-6), 1.0).astype(DTYPE)
 
     def __call__(self, x: Float[Array, "... d"]) -> Float[Array, "... d"]:
-        """Inputs scaled, and cut off ten deviations from the mean. The statistic has no gradient."""
+        """Scale inputs, and clip them ten deviations from the mean. The statistic has no gradient."""
         mean, deviation = jax.lax.stop_gradient((self.mean, self.deviation))
         return jnp.clip((jnp.asarray(x, DTYPE) - mean) / deviation, -10, 10)
 
@@ -147,9 +147,9 @@ class ShapedReward(eqx.Module):
     """``f(s, a, s') = g(s, a) + gamma h(s') - h(s)`` (Fu, Luo and Levine 2018, Eq. 4).
 
     ``g`` is the reward, ``h`` a potential that shapes it and changes no optimal behaviour (Ng, Harada and
-    Russell 1999). An episode that terminates goes on in an absorbing state of potential zero, where every
-    step earns ``absorbing``: without it, rewards that happen to be negative teach to end the episode
-    (Kostrikov et al. 2019).
+    Russell 1999). An episode that terminates continues in an absorbing state of potential zero, where every
+    step earns ``absorbing``. Without it, negative rewards would favour ending the episode (Kostrikov et al.
+    2019).
 
     Fields
     ------
@@ -178,7 +178,7 @@ class ShapedReward(eqx.Module):
         state_only: bool = False,
         activation: str = "relu",
     ) -> ShapedReward:
-        """Networks with the given hidden layers; ``state_only`` makes ``g`` a function of the state alone."""
+        """Create networks with the given hidden layers; ``state_only`` makes ``g(s)`` of the state alone."""
         k_g, k_h = jax.random.split(key)
         inputs = observation_size + (0 if state_only else actions.size)
         return ShapedReward(
@@ -192,7 +192,7 @@ class ShapedReward(eqx.Module):
         )
 
     def __call__(self, observations: Float[Array, "... d"], actions: ArrayLike) -> Float[Array, "..."]:
-        """The reward ``g(s, a)`` itself."""
+        """Return the reward ``g(s, a)``."""
         return self.reward_at(self.norm(observations), self.actions.encode(actions))
 
     def shaped(
@@ -202,12 +202,12 @@ class ShapedReward(eqx.Module):
         successors: Float[Array, "... d"],
         terminated: ArrayLike,
     ) -> Float[Array, "..."]:
-        """``f(s, a, s')``, the potential of what follows termination being zero."""
+        """Return ``f(s, a, s')``; after termination the potential is zero."""
         z, following = self.norm(observations), self.norm(successors)
         return self.shaped_at(z, self.actions.encode(actions), following, jnp.asarray(terminated))
 
     def reward_at(self, z: Float[Array, "... d"], a: Float[Array, "... size"]) -> Float[Array, "..."]:
-        """``g`` of a scaled observation and an encoded action."""
+        """Return ``g`` of a scaled observation and an encoded action."""
         return self.reward(z if self.state_only else jnp.concatenate([z, a], -1))[..., 0]
 
     def shaped_at(
@@ -217,13 +217,13 @@ class ShapedReward(eqx.Module):
         following: Float[Array, "... d"],
         terminated: Array,
     ) -> Float[Array, "..."]:
-        """``f`` of scaled observations and encoded actions."""
+        """Return ``f`` of scaled observations and encoded actions."""
         after = jnp.where(terminated, 0.0, self.potential(following)[..., 0])
         return self.reward_at(z, a) + self.discount * after - self.potential(z)[..., 0]
 
 
 class GaussianPolicy(eqx.Module):
-    """Actions normal about a network of the state, with deviations that do not depend on it.
+    """Gaussian actions about a network of the state, with deviations independent of the state.
 
     Fields
     ------
@@ -245,38 +245,38 @@ class GaussianPolicy(eqx.Module):
         hidden: Sequence[int] = (32, 32),
         log_deviation: float = 0.0,
     ) -> GaussianPolicy:
-        """A policy whose means are near zero."""
+        """Create a policy whose means are near zero."""
         net = MLP.create(key, (observation_size, *hidden, actions.size), last=0.01)
         return GaussianPolicy(
             net, jnp.full(actions.size, log_deviation, DTYPE), RunningNorm.create(observation_size), actions
         )
 
     def mode(self, observations: Float[Array, "... d"]) -> Float[Array, "... k"]:
-        """The mean action."""
+        """Return the mean action."""
         return self.mean(self.norm(observations))
 
     def sample(self, key: Array, observations: Float[Array, "... d"]) -> Float[Array, "... k"]:
-        """Actions drawn; not cut to the bounds, which environments do."""
+        """Draw actions; environments clip them to the bounds."""
         mean = self.mode(observations)
         return mean + jnp.exp(self.log_deviation) * jax.random.normal(key, mean.shape, DTYPE)
 
     def log_prob(
         self, observations: Float[Array, "... d"], actions: Float[Array, "... k"]
     ) -> Float[Array, "..."]:
-        """Log-density, in nats."""
+        """Return the log-density, in nats."""
         z = (jnp.asarray(actions, DTYPE) - self.mode(observations)) * jnp.exp(-self.log_deviation)
         return (
             -0.5 * jnp.sum(z**2, -1) - jnp.sum(self.log_deviation) - 0.5 * z.shape[-1] * math.log(2 * math.pi)
         )
 
     def entropy(self, observations: Float[Array, "... d"]) -> Float[Array, "..."]:
-        """Differential entropy, in nats."""
+        """Return the differential entropy, in nats."""
         one = jnp.sum(self.log_deviation + 0.5 * math.log(2 * math.pi * math.e)).astype(DTYPE)
         return jnp.broadcast_to(one, observations.shape[:-1])
 
 
 class CategoricalPolicy(eqx.Module):
-    """One of ``n`` actions, with logits from a network of the state.
+    """Choice of one of ``n`` actions, with logits from a network of the state.
 
     Fields
     ------
@@ -292,31 +292,31 @@ class CategoricalPolicy(eqx.Module):
     def create(
         key: Array, observation_size: int, actions: ActionSpace, hidden: Sequence[int] = (32, 32)
     ) -> CategoricalPolicy:
-        """A policy near uniform."""
+        """Create a policy near uniform."""
         net = MLP.create(key, (observation_size, *hidden, actions.n), last=0.01)
         return CategoricalPolicy(net, RunningNorm.create(observation_size), actions)
 
     def log_probs(self, observations: Float[Array, "... d"]) -> Float[Array, "... n"]:
-        """Log-probabilities of all actions, in nats."""
+        """Return the log-probabilities of all actions, in nats."""
         return jax.nn.log_softmax(self.logits(self.norm(observations)))
 
     def mode(self, observations: Float[Array, "... d"]) -> Int[Array, "..."]:
-        """The likeliest action."""
+        """Return the likeliest action."""
         return jnp.argmax(self.log_probs(observations), -1)
 
     def sample(self, key: Array, observations: Float[Array, "... d"]) -> Int[Array, "..."]:
-        """Actions drawn."""
+        """Draw actions."""
         return jax.random.categorical(key, self.log_probs(observations))
 
     def log_prob(
         self, observations: Float[Array, "... d"], actions: Int[Array, "..."]
     ) -> Float[Array, "..."]:
-        """Log-probability, in nats."""
+        """Return the log-probability, in nats."""
         chosen = jnp.asarray(actions)[..., None]
         return jnp.take_along_axis(self.log_probs(observations), chosen, -1)[..., 0]
 
     def entropy(self, observations: Float[Array, "... d"]) -> Float[Array, "..."]:
-        """Entropy, in nats."""
+        """Return the entropy, in nats."""
         log_p = self.log_probs(observations)
         return -jnp.sum(jnp.exp(log_p) * log_p, -1)
 
@@ -327,6 +327,6 @@ Policy = GaussianPolicy | CategoricalPolicy
 def policy_network(
     key: Array, observation_size: int, actions: ActionSpace, hidden: Sequence[int] = (32, 32)
 ) -> Policy:
-    """The kind of policy that the actions ask for."""
+    """Create the policy of the action space: categorical or Gaussian."""
     kind = CategoricalPolicy if actions.discrete else GaussianPolicy
     return kind.create(key, observation_size, actions, hidden)

@@ -1,4 +1,4 @@
-"""What predicates tell apart, and on which of them reports agree with what they are about (chapter 6.1)."""
+"""Classes of pairs that predicates cannot distinguish, and expected agreements with them (chapter 6.1)."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from .evidence import FeatureNoise, checked_predicates
 
 @shown_briefly
 class PredicateClasses(NamedTuple):
-    """Pairs that no predicate tells apart, gathered: the program's cost is in classes, not in pairs.
+    """Pairs gathered by their predicates: programs cost in classes, not in pairs.
 
     Fields
     ------
     vectors : bool or int ``[C, J]``
         Values of the predicates in each class.
     reportable : float ``[C]``
-        How many pairs of each class perception may report.
+        Number of pairs of each class that perception may report.
     of_pair : int ``[S, A]``
         The class of each pair.
     """
@@ -32,20 +32,20 @@ class PredicateClasses(NamedTuple):
 
     @property
     def agreements(self) -> Float[np.ndarray, "C C J"]:
-        """Whether each predicate of a truth (first) is that of a report (second)."""
+        """Compare each predicate of a hidden pair (first) with that of an observation (second)."""
         return (self.vectors[:, None] == self.vectors[None]).astype(float)
 
     def gather(self, weights: ArrayLike) -> Float[np.ndarray, " C"]:
-        """Weights of pairs ``[S, A]`` as weights of classes, of sum one; ``ValueError`` if they cannot."""
+        """Sum weights ``[S, A]`` over classes and normalise them to one; ``ValueError`` if they cannot be."""
         w = self.checked(weights)
         return self.sum(w) / w.sum()
 
     def sum(self, weights: Float[np.ndarray, "S A"]) -> Float[np.ndarray, " C"]:
-        """Weights of pairs, summed in each class."""
+        """Sum weights of pairs over each class."""
         return np.bincount(self.of_pair.ravel(), weights.ravel(), len(self.vectors))
 
     def checked(self, weights: ArrayLike, zero: bool = False) -> Float[np.ndarray, "S A"]:
-        """Weights of pairs; ``ValueError`` if negative or not finite, or all zero unless ``zero``."""
+        """Check weights of pairs; ``ValueError`` if negative, not finite, or all zero unless ``zero``."""
         w = np.asarray(weights, float)
         if w.shape != self.of_pair.shape:
             raise ValueError(
@@ -62,11 +62,11 @@ class PredicateClasses(NamedTuple):
 def predicate_classes(predicates: ArrayLike, reportable: ArrayLike | None = None) -> PredicateClasses:
     """Gather the pairs ``[S, A]`` by their predicates ``[J, S, A]``.
 
-    ``reportable [S, A]`` marks what perception may report; everything by default. Raises ``ValueError`` as
-    ``FeatureNoise`` does.
+    ``reportable [S, A]`` marks the pairs that perception may report; all by default. Raises ``ValueError``
+    as ``FeatureNoise`` does.
     """
     psi = np.asarray(predicates)
-    # One border for both: what can be learned is what can be injected.
+    # The border of FeatureNoise: a learner accepts the predicates that an injector accepts.
     mask = None if reportable is None else np.asarray(reportable)
     noise = FeatureNoise(psi, np.full(psi.shape[:1], 0.5), mask)
     psi, mask = np.asarray(noise.predicates), np.asarray(noise.reportable)
@@ -80,7 +80,7 @@ def predicate_classes(predicates: ArrayLike, reportable: ArrayLike | None = None
 def agreement_patterns(
     agreements: Bool[np.ndarray, "C R J"] | Float[np.ndarray, "C R J"],
 ) -> tuple[Float[np.ndarray, "E J"], Int[np.ndarray, "C R"]]:
-    """The different rows of agreements on predicates, and which of them each truth and report have."""
+    """Return the distinct rows of agreements, and the row that each hidden pair and observation has."""
     rows = agreements.reshape(-1, agreements.shape[-1]).astype(bool)
     _, first, which = np.unique(np.packbits(rows, axis=1), axis=0, return_index=True, return_inverse=True)
     return rows[first].astype(float), which.reshape(agreements.shape[:-1])
@@ -88,14 +88,14 @@ def agreement_patterns(
 
 @shown_briefly
 class ReportedMatches(NamedTuple):
-    """What a posterior over truths says of the reports of a session.
+    """Expected agreements of a session's observations with the pairs behind them.
 
     Fields
     ------
     weights : float ``[S, A]``
-        How many reports each truth is expected to have had.
+        Expected number of observations of each hidden pair.
     matches : float ``[J]``
-        On how many reports each predicate is expected to have been that of the truth.
+        Expected number of observations whose predicate ``j`` equals that of the hidden pair.
     """
 
     weights: Float[np.ndarray, "S A"]
@@ -103,7 +103,7 @@ class ReportedMatches(NamedTuple):
 
     @property
     def agreement(self) -> Float[np.ndarray, " J"]:
-        """The program's target: expected matches per report."""
+        """The program's target: expected matches per observation."""
         return self.matches / self.weights.sum()
 
 
@@ -113,19 +113,19 @@ def reported_matches(
     actions: ArrayLike,
     posterior: ArrayLike,
 ) -> ReportedMatches:
-    """Count expected matches of reports with truths; counts of sessions add up.
+    """Count expected matches of observations with hidden pairs; counts of sessions add up.
 
     Parameters
     ----------
     predicates : bool or int ``[J, S, A]``
     states, actions : int ``[T]``
-        The pairs reported.
+        The observed pairs.
     posterior : float ``[T, S, A]``
-        Of the truth behind each report. A point at the true pair gives the ``oracle`` of the sources, one at
-        the report itself ``observed``.
+        Posterior over the pair behind each observation. A point at the true pair gives the ``oracle`` of
+        the sources, a point at the observation gives ``observed``.
 
     Raises ``ValueError`` for bad predicates, shapes that do not fit, indices out of range, or a posterior
-    that is none.
+    whose rows do not sum to one.
     """
     psi, truth = checked_predicates(predicates), np.asarray(posterior, float)
     s, a = np.asarray(states), np.asarray(actions)
@@ -143,6 +143,6 @@ def reported_matches(
     if wrong.any():
         t = int(np.flatnonzero(wrong)[0])
         raise ValueError(f"the posterior of report {t} is no distribution: it sums to {total[t]}")
-    # One predicate at a time: who agrees with whom is [T, S, A].
+    # One predicate at a time: a table of all agreements would be [J, T, S, A].
     same = (labels == labels[s, a][:, None, None] for labels in psi)
     return ReportedMatches(truth.sum(0), np.array([truth[which].sum() for which in same]))

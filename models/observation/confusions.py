@@ -1,4 +1,4 @@
-"""Perception that takes some pairs for others, each confusion with a probability."""
+"""Perception that confuses some pairs with others, each confusion with a probability."""
 
 from __future__ import annotations
 
@@ -21,22 +21,22 @@ class _ConfusionFields(NamedTuple):
 @shown_briefly
 @rebuilt_unchecked
 class Confusions(_ConfusionFields):
-    """A pair is reported as another with the probability of the one confusion that acts on it.
+    """Noise that reports a pair as another with the probability of the one confusion that acts on it.
 
-    An observation model that also injects its noise, and whose few probabilities can be learned.
+    It is an observation model that also injects its noise; its few probabilities can be learned.
 
     Parameters
     ----------
     reports : int ``[M, S, A]``
-        What each confusion takes a pair for, as the flat index ``s * A + a``; the pair itself where it has
-        nothing to confuse. A pair is confused in one way at most.
+        The pair that each confusion reports, as the flat index ``s * A + a``; the pair itself where the
+        confusion does not act. At most one confusion acts on a pair.
     chances : float ``[M]``
-        Probability of each, where it acts.
+        Probability of each confusion, where it acts.
 
     Raises
     ------
     ValueError
-        For probabilities outside [0, 1], indices of no pair, or two confusions of one pair.
+        For probabilities outside [0, 1], indices outside the pairs, or two confusions of one pair.
     """
 
     __slots__ = ()
@@ -56,29 +56,29 @@ class Confusions(_ConfusionFields):
     def of_actions(
         n_states: int, pairs: list[tuple[int, int]], chances: np.ndarray, n_actions: int
     ) -> Confusions:
-        """``(truth, report)`` of actions, the same in every state; ``chances`` has an entry for each."""
+        """Build confusions ``(truth, report)`` of actions in every state; ``chances`` has one entry each."""
         reports = np.tile(np.arange(n_states * n_actions).reshape(n_states, n_actions), (len(pairs), 1, 1))
         for m, (truth, report) in enumerate(pairs):
             reports[m, :, truth] = reports[m, :, report]
         return Confusions(reports, np.asarray(chances, float))
 
     def __mul__(self, other: AnySensor) -> Sensor:  # type: ignore[override]
-        """Compose with another imperfection, such as a :class:`Visibility`."""
+        """Compose with another sensor, such as a :class:`Visibility`."""
         return self.noise * other
 
     @property
     def visibility(self) -> None:
-        """Noise hides nothing."""
+        """None: the noise hides no step."""
         return None
 
     @property
     def acts(self) -> Bool[Array, "M S A"]:
-        """Where each confusion has something to confuse."""
+        """Marks of the pairs on which each confusion acts."""
         return self.reports != jnp.arange(self.reports[0].size).reshape(self.reports.shape[1:])
 
     @property
     def noise(self) -> ObservationModel:
-        """``O(o | g)``: the noise at the confusion's report, the rest at the pair itself."""
+        """``O(o | g)``: the probability of the confusion at its report, the rest at the pair itself."""
         shape, size = self.reports.shape[1:], self.reports[0].size
         chance = jnp.where(self.acts, self.chances[:, None, None], 0.0).reshape(len(self.chances), size)
         g = jnp.arange(size)
@@ -87,7 +87,7 @@ class Confusions(_ConfusionFields):
         return ObservationModel._make((jnp.log(table).reshape(*shape, *shape),))
 
     def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
-        """Which confusion turned each truth into its report (flat indices); none where none does."""
+        """Mark the confusion that turned each hidden pair into its observation (flat indices), if any did."""
         flat = self.reports.reshape(len(self.chances), -1)[:, truth]
         return ((flat == report) & (flat != truth)).T
 

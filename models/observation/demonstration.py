@@ -1,6 +1,6 @@
-"""Demonstrations: what a learner was given, gaps included, and their interchange format.
+"""Demonstrations, which may have hidden and lost steps, and their interchange format.
 
-The format is JSON Lines, one trajectory a line (``docs`` of every field in :func:`read_trajectories`)::
+The format is JSON Lines, one trajectory a line (every field is documented in :func:`read_trajectories`)::
 
     {"id": "patrol-0", "steps": [{"s": "(0,5) east", "a": "forward"}, "hidden", null, {"s": 3, "score": 0.9}]}
 """
@@ -42,7 +42,7 @@ Step = dict[str, Any] | tuple[Any, Any] | list[Any] | np.ndarray | str | None
 
 
 class DemonstrationError(ValueError):
-    """A demonstration that cannot be read or that the model rules out; names the record at fault."""
+    """A demonstration that cannot be read or that the model excludes; names the record at fault."""
 
 
 @partial(
@@ -60,12 +60,12 @@ class Demonstration:
     Attributes
     ----------
     kind : int8 ``[n, L]``
-        ``SEEN``; ``HIDDEN`` (the learner looked and saw nothing, which is itself evidence); ``LOST`` (no
-        frame, no evidence); ``PAD`` beyond the trajectory's end.
+        ``SEEN``; ``HIDDEN`` (the sensor was on and saw no expert, which is evidence); ``LOST`` (no frame,
+        no evidence); ``PAD`` beyond the trajectory's end.
     state, action : int32 ``[n, L]``
-        What was seen; ``UNKNOWN`` (-1) for an unseen coordinate.
+        The observed coordinates; ``UNKNOWN`` (-1) for a hidden one.
     score : float ``[n, L]``
-        Perception's confidence in a seen pair, NaN where it gave none.
+        Perception's confidence in an observed pair; NaN if it gave none.
     """
 
     kind: Int[np.ndarray, "n L"]
@@ -145,7 +145,7 @@ class Demonstration:
 
     @staticmethod
     def from_codes(codes: Int[np.ndarray, "n L 3"]) -> Demonstration:
-        """Inverse of :attr:`codes` (without scores)."""
+        """Build a demonstration from :attr:`codes` (without scores)."""
         codes = np.asarray(codes)
         return Demonstration(
             codes[..., 0].astype(np.int8),
@@ -160,7 +160,7 @@ class Demonstration:
 
         Floats must be whole. Use :meth:`from_arrays` if steps are hidden or trajectories differ in length.
         Raises :class:`DemonstrationError` naming trajectory and step, ``ValueError`` for other shapes and
-        ``TypeError`` for arrays of something else.
+        ``TypeError`` for arrays of other types.
         """
         return _from_arrays(states, actions, complete=True)
 
@@ -186,25 +186,25 @@ class Demonstration:
         states, actions : int ``[n, L]`` or ``[L]``
             Whole numbers; floats are accepted if they are whole.
         seen : bool ``[n, L]``, optional
-            False hides a step, whatever the arrays hold there: somebody looked and saw nothing.
+            False hides a step, whatever the arrays hold there: the sensor was on and saw no expert.
         lost : bool ``[n, L]``, optional
-            True marks a lost frame, whatever the arrays hold there: nobody looked.
+            True marks a lost frame, whatever the arrays hold there: the sensor gave no evidence.
         lengths : int ``[n]``, optional
-            Steps of each trajectory; what follows is padding, whatever the arrays hold there.
+            Steps of each trajectory; the rest is padding, whatever the arrays hold there.
         scores : float ``[n, L]``, optional
-            Perception's confidence in [0, 1]; NaN where it gave none.
+            Perception's confidence in [0, 1]; NaN if it gave none.
         missing : number, optional
-            A value that stands for an unknown coordinate, such as -1 or NaN.
+            The value of an unknown coordinate, such as -1 or NaN.
 
         Raises
         ------
         DemonstrationError
-            For a number that is not whole, negative or beyond 32 bits, for a score outside [0, 1], and for a
-            step that ``seen`` calls seen without a state and an action; names trajectory and step.
+            For a number that is fractional, negative or beyond 32 bits, for a score outside [0, 1], and for a
+            step marked by ``seen`` without a state and an action; names trajectory and step.
         ValueError
             For arrays of other shapes, and lengths outside 0 to ``L``.
         TypeError
-            For arrays of something else than numbers.
+            For arrays that do not hold numbers.
 
         Examples
         --------
@@ -224,18 +224,18 @@ class Demonstration:
         """Build from lists of steps as in the interchange format.
 
         A seen pair may also be a tuple, a list or an array ``(s, a)``, and a trajectory an array ``[L, 2]``.
-        Raises :class:`DemonstrationError` naming trajectory and step, ``TypeError`` for what is not a list
-        of lists of steps.
+        Raises :class:`DemonstrationError` naming trajectory and step, and ``TypeError`` for anything but
+        lists of lists of steps.
         """
         names = _Names(mdp)
         return _stack([_row(steps, names, i) for i, steps in enumerate(_iterated(trajectories))])
 
     def select(self, rows: slice | np.ndarray | list[int]) -> Demonstration:
-        """Some of the trajectories."""
+        """Select some of the trajectories."""
         return self[rows]
 
     def padded(self, n_trajectories: int, length: int) -> Demonstration:
-        """The same demonstration in a larger array, so that one compiled program serves many sizes."""
+        """Pad to a larger array, so that one compiled program serves many sizes."""
         n, width = self.kind.shape
         if n > n_trajectories or width > length:
             raise ValueError(
@@ -251,12 +251,12 @@ class Demonstration:
         )
 
     def bucketed(self) -> Demonstration:
-        """Padded to the next powers of two: streams of ragged sessions meet only a few shapes."""
+        """Pad to the next powers of two: ragged sessions then have only a few shapes."""
         n, width = self.kind.shape
         return self.padded(_power_of_two(n), _power_of_two(width))
 
     def sessions(self, trajectories: int = 1) -> Iterator[Demonstration]:
-        """Split into consecutive sessions of so many trajectories (Definition 4); the last may be shorter."""
+        """Split into consecutive sessions of ``trajectories`` each (Definition 4); the last may be short."""
         if trajectories < 1:
             raise ValueError(f"a session needs at least one trajectory, got {trajectories}")
         for start in range(0, self.n_trajectories, trajectories):
@@ -275,7 +275,7 @@ class Demonstration:
 
 
 def concatenate(demonstrations: Sequence[Demonstration]) -> Demonstration:
-    """All trajectories of several demonstrations, padded to the longest."""
+    """Concatenate the trajectories of several demonstrations, padded to the longest."""
     if not demonstrations:
         raise ValueError("nothing to concatenate")
     width = max(d.kind.shape[1] for d in demonstrations)
@@ -324,9 +324,11 @@ def _stack(rows: list[list[tuple[int, int, int, float]]]) -> Demonstration:
 
 def _padding(shape: tuple[int, ...]) -> Demonstration:
     return Demonstration(
-        np.full(shape, PAD, np.int8), np.full(shape, UNKNOWN, np.int32),
-        np.full(shape, UNKNOWN, np.int32), np.full(shape, np.nan),
-    )  # fmt: skip
+        np.full(shape, PAD, np.int8),
+        np.full(shape, UNKNOWN, np.int32),
+        np.full(shape, UNKNOWN, np.int32),
+        np.full(shape, np.nan),
+    )
 
 
 def _iterated(trajectories: Any) -> Iterator[Any]:
@@ -372,7 +374,7 @@ def _from_arrays(
     missing: float | None = None,
     complete: bool = False,
 ) -> Demonstration:
-    """As :meth:`Demonstration.from_arrays`; where it is ``complete``, nothing may be missing."""
+    """Build trajectories as :meth:`Demonstration.from_arrays` does; ``complete`` refuses missing values."""
     (s, no_state), (a, no_action) = (
         _numbers(name, given, missing) for name, given in (("states", states), ("actions", actions))
     )
@@ -408,11 +410,11 @@ def _from_arrays(
 
 
 def _numbers(name: str, given: Any, missing: float | None) -> tuple[np.ndarray, Bool[np.ndarray, "n L"]]:
-    """Numbers ``[n, L]`` of any type, and which of them are missing."""
+    """Convert to numbers ``[n, L]`` of any type, and mark the missing ones."""
     absent: Any = False
     if hasattr(given, "isna") and hasattr(given, "to_numpy"):  # pandas
         absent = np.asarray(given.isna())
-        # Integers of 64 bits would become floats where one is missing, and then be rounded.
+        # Beside a missing value, 64-bit integers would become floats and be rounded.
         given = given.to_numpy(dtype=object, na_value=0) if absent.any() else given.to_numpy()
     elif isinstance(given, list | tuple) and any(isinstance(row, np.ma.MaskedArray) for row in given):
         given = np.ma.stack(given)
@@ -452,7 +454,7 @@ def _as_float(number: float) -> float:
 def _indices(
     name: str, numbers: np.ndarray, known: Bool[np.ndarray, "n L"], hint: str
 ) -> Int[np.ndarray, "n L"]:
-    """Known numbers as indices, others ``UNKNOWN``."""
+    """Convert known numbers to indices, others to ``UNKNOWN``."""
     with np.errstate(invalid="ignore"):
         wrong = known & ~((numbers >= 0) & (numbers < 2**31) & (numbers == np.floor(numbers)))
     if wrong.any():
@@ -494,7 +496,7 @@ def _refuse(wrong: Bool[np.ndarray, "n L"], message: str) -> NoReturn:
 
 
 class _Names:
-    """Resolves names and indices of states and actions, with errors in the user's terms."""
+    """Names and indices of states and actions, with errors in the user's terms."""
 
     def __init__(self, mdp: TabularMDP) -> None:
         if not isinstance(mdp, TabularMDP):
@@ -524,7 +526,7 @@ class _Names:
         return int(value)
 
     def step(self, step: Any) -> tuple[int, int, int, float]:
-        """Kind, state, action and score of a step. Raises :class:`DemonstrationError`, without the place."""
+        """Return kind, state, action and score of a step; :class:`DemonstrationError` lacks the place."""
         if step is None:
             return LOST, UNKNOWN, UNKNOWN, math.nan
         if isinstance(step, str) and step == "hidden":
@@ -557,16 +559,16 @@ def _index(names: tuple[str, ...] | None, prefix: str, count: int) -> dict[str, 
 
 
 class LineLimits(NamedTuple):
-    """How large a line of a file may be, so that reading it takes bounded memory.
+    """Limits of a line of a file, so that reading it takes bounded memory.
 
     Fields
     ------
     size : int
-        Bytes of a line, or characters where it comes as text; 4 Mi by default. Parsing takes up to 30 bytes
-        of memory for each.
+        Bytes of a line, or characters of a line of text; 4 Mi by default. Parsing takes up to 30 bytes of
+        memory for each.
     steps : int
-        Steps of a trajectory, or nodes of a bout; 10,000 by default. A learner's memory grows with them times
-        states times actions.
+        Steps of a trajectory, or nodes of a bout; 10,000 by default. A learner's memory grows with this
+        number times states times actions.
     """
 
     size: int = 4 * 2**20
@@ -589,11 +591,11 @@ class Record(NamedTuple):
 def parsed_lines(
     lines: Iterable[str | bytes], source: str, first_line: int = 1, limits: LineLimits = DEFAULT_LIMITS
 ) -> Iterator[tuple[int, str, Any]]:
-    """Yield number, place for messages, and content of each line of JSON Lines; blank lines are skipped.
+    """Yield number, place for messages, and content of each line of JSON Lines; skip blank lines.
 
     Bytes are decoded from UTF-8; a byte order mark may begin the first line of a file. Raises
-    :class:`DemonstrationError` naming ``source`` and line for what is not JSON, and for lines longer than
-    ``limits.size``; ``TypeError`` for what is not lines.
+    :class:`DemonstrationError` naming ``source`` and line for invalid JSON and for lines longer than
+    ``limits.size``, and ``TypeError`` for anything but lines.
     """
     if not isinstance(limits, LineLimits):
         raise TypeError(f"limits must be LineLimits(size, steps); got {shortened(limits)}")
@@ -622,7 +624,7 @@ def parsed_lines(
 
 
 def _decodable(lines: Iterable[str | bytes], source: str, first_line: int) -> Iterator[str | bytes]:
-    """The lines; where the file itself decodes them, errors say after which line."""
+    """Yield the lines; if the file itself decodes them, errors say after which line."""
     read = first_line - 1
     try:
         for line in lines:
@@ -646,13 +648,13 @@ def read_trajectories(
 ) -> Iterator[Record]:
     """Read trajectories from JSON Lines, one at a time.
 
-    A line is an object with ``steps`` and optionally ``id`` (string) and ``agent`` (which of several
-    experts, an integer), or just the list of steps. A step is ``{"s": state, "a": action, "score": c}``
-    (each by name or index; ``s`` or ``a`` may be missing if it was not perceived; ``score`` in [0, 1] is
-    optional), ``"hidden"`` (looked, saw nothing) or ``null`` (a lost frame). Blank lines are skipped;
-    ``first_line`` is the number of the first one, for a reader that starts midway. ``limits`` bounds the
-    size and steps of a line, and so the memory that reading it takes. Raises
-    :class:`DemonstrationError` naming ``source``, line and step.
+    A line is an object with ``steps`` and optionally ``id`` (string) and ``agent`` (index of one of several
+    experts), or just the list of steps. A step is ``{"s": state, "a": action, "score": c}`` (each by name or
+    index; ``s`` or ``a`` may be missing if it was hidden; ``score`` in [0, 1] is optional), ``"hidden"`` (the
+    sensor was on and saw no expert) or ``null`` (a lost frame). Blank lines are skipped. ``first_line`` is
+    the number of the first line, for a reader that starts midway. ``limits`` bounds the size and steps of a
+    line, and thereby the memory that reading it takes. Raises :class:`DemonstrationError` naming ``source``,
+    line and step.
     """
     names = _Names(mdp)
     for number, where, content in parsed_lines(lines, source, first_line, limits):
@@ -683,7 +685,7 @@ def read_trajectories(
 
 
 def identity_of(value: Any, where: str) -> str | None:
-    """The ``id`` of a line, text or a number. Raises :class:`DemonstrationError`."""
+    """Return the ``id`` of a line, text or a number. Raises :class:`DemonstrationError`."""
     if value is None:
         return None
     if isinstance(value, bool) or not isinstance(value, str | int | float):
@@ -718,12 +720,12 @@ def write_trajectories(
     ids: Sequence[str] | None = None,
     agents: Sequence[int] | None = None,
 ) -> None:
-    """Write trajectories as JSON Lines, by name where the MDP has names, otherwise by index.
+    """Write trajectories as JSON Lines, by name if the MDP has names, otherwise by index.
 
-    Rows that are all padding are no trajectories and are left out. ``ids`` (text or integers) and ``agents``
-    (integers) have an entry for every row; ``ValueError`` if not, ``TypeError`` for other entries. Raises
-    :class:`DemonstrationError` naming trajectory and step for what could not be read back: states and actions
-    that the MDP lacks, a seen step without either, a score outside [0, 1].
+    Rows of padding alone are left out. ``ids`` (text or integers) and ``agents`` (integers) have an entry
+    for every row; ``ValueError`` if not, ``TypeError`` for other entries. Raises :class:`DemonstrationError`
+    naming trajectory and step for steps that could not be read back: states and actions that the MDP lacks, a
+    seen step without either, a score outside [0, 1].
     """
     if not hasattr(file, "write"):
         raise TypeError(f"file must be a file open for writing text; got {shortened(file)}")
@@ -748,7 +750,7 @@ def write_trajectories(
 
 
 def _written(kind: int, state: int, action: int, score: float, names: _Names, mdp: TabularMDP) -> Any:
-    """A step as JSON. Raises :class:`DemonstrationError` for one that could not be read back."""
+    """Write a step as JSON. Raises :class:`DemonstrationError` for one that could not be read back."""
     if kind in (HIDDEN, LOST):
         return "hidden" if kind == HIDDEN else None
     if kind != SEEN:

@@ -1,9 +1,9 @@
-"""Imperfect perception, as evidence about hidden state-action pairs.
+"""Sensors as evidence about hidden state-action pairs.
 
-Whatever a learner perceived at a step, the imperfection turns it into ``e_t(s, a)``, the probability of
-perceiving just that if the truth were ``(s, a)``. A sensor has two factors: *presence* (was the step in
-view at all?) and *reading* (what did perception report of a step in view?). Imperfections supply one or
-both and compose with ``*``.
+A sensor turns the observation of a step into ``e_t(s, a)``, the probability of that observation if the
+truth were ``(s, a)``. It has two factors: its *visibility* is the probability that a step is in view, and
+its *noise* is the distribution of the observation of a step in view. Sensors supply one factor or both and
+compose with ``*``.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from .demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN, Demonstration, Demo
 
 
 class AnySensor(Protocol):
-    """Anything that turns what was perceived into evidence; methods never ask which one they were given."""
+    """Any object that turns observations into evidence; methods treat all of them alike."""
 
     @property
     def visibility(self) -> Float[Array, " S"] | None:
@@ -33,11 +33,11 @@ class AnySensor(Protocol):
 
     @property
     def noise(self) -> ObservationModel | None:
-        """What perception reports of a step in view; None means exactly the truth."""
+        """Distribution of the observation of a step in view; None means exactly the truth."""
 
 
 class _Composable:
-    """Products of imperfections."""
+    """Base of sensors that compose with ``*``."""
 
     def __mul__(self: AnySensor, other: AnySensor) -> Sensor:
         other = as_sensor(other)
@@ -63,10 +63,10 @@ class _SensorFields(NamedTuple):
 @shown_briefly
 @rebuilt_unchecked
 class Sensor(_Composable, _SensorFields):  # type: ignore[misc]
-    """A product of imperfections; ``Sensor()`` sees everything exactly.
+    """A product of visibility and noise; ``Sensor()`` sees everything exactly.
 
-    ``visibility`` and ``noise`` may also be imperfections that have one. Raises ``ValueError`` for a presence
-    that is no probability and ``TypeError`` for a reading that reports nothing.
+    ``visibility`` and ``noise`` may also be sensors that have one. Raises ``ValueError`` for a visibility
+    outside [0, 1] and ``TypeError`` for noise that is not an observation model.
     """
 
     __slots__ = ()
@@ -85,7 +85,7 @@ class Sensor(_Composable, _SensorFields):  # type: ignore[misc]
 
 
 def _is_sensor(given: Any) -> bool:
-    # Looked up statically, as a reading may be a large table that is computed when it is asked for.
+    # Looked up statically: a sensor may compute its noise, a large table, whenever the attribute is read.
     missing = object()
     return not isinstance(given, type) and not any(
         getattr_static(given, name, missing) is missing for name in ("visibility", "noise")
@@ -93,9 +93,9 @@ def _is_sensor(given: Any) -> bool:
 
 
 def as_sensor(given: Any) -> AnySensor:
-    """Take a sensor, or make a :class:`Visibility` of a mask of the states in view.
+    """Take a sensor, or make a :class:`Visibility` from a mask of the states in view.
 
-    Raises ``TypeError`` for anything else and ``ValueError`` for a mask that is no probability.
+    Raises ``TypeError`` for anything else and ``ValueError`` for a mask outside [0, 1].
 
     Examples
     --------
@@ -110,7 +110,7 @@ def as_sensor(given: Any) -> AnySensor:
         if mask is None or (mask.ndim == 1 and mask.dtype.kind in "bf"):
             return Visibility(given)
     raise TypeError(
-        "sensor must be a Visibility, an ObservationModel, another imperfection or a product of them, or a "
+        "sensor must be a Visibility, an ObservationModel, another sensor or a product of them, or a "
         f"boolean mask [S] of the states in view; Sensor() sees everything; got {described(given)}"
     )
 
@@ -135,25 +135,25 @@ class _VisibilityFields(NamedTuple):
 @shown_briefly
 @rebuilt_unchecked
 class Visibility(_Composable, _VisibilityFields):  # type: ignore[misc]
-    """A view that covers some states: ``in_view[s]`` is the probability of seeing a step in ``s``.
+    """Visibility of states: ``in_view[s]`` is the probability of seeing a step in ``s``.
 
-    A boolean mask is the usual case. A step that is not seen is evidence that the expert is out of view.
+    A boolean mask is the usual case. A hidden step is evidence that the expert is out of view.
     """
 
     __slots__ = ()
 
     def __new__(cls, in_view: ArrayLike) -> Visibility:
-        """Check and convert ``in_view``; ``ValueError`` if it is no probability."""
+        """Check and convert ``in_view``; ``ValueError`` if it is outside [0, 1]."""
         return super().__new__(cls, _checked_view("in_view", in_view))
 
     @property
     def visibility(self) -> Float[Array, " S"]:
-        """The view itself."""
+        """The probabilities ``in_view``."""
         return self.in_view
 
     @property
     def noise(self) -> None:
-        """What is in view is seen exactly."""
+        """None: steps in view are observed exactly."""
         return None
 
 
@@ -164,11 +164,11 @@ class _ObservationFields(NamedTuple):
 @shown_briefly
 @rebuilt_unchecked
 class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
-    """A full confusion of pairs: ``log O(o_s, o_a | s, a)`` as ``[S, A, S, A]``, truth first.
+    """Noise that confuses pairs: ``log O(o_s, o_a | s, a)`` as ``[S, A, S, A]``, truth first.
 
     Build it from probabilities with :meth:`from_probabilities`, or from independent confusions of states
-    ``[S, S]`` and actions ``[A, A]`` with :meth:`from_factors`. Rows must sum to one within what the
-    precision of the given numbers allows, and are normalised to 64 bits.
+    ``[S, S]`` and actions ``[A, A]`` with :meth:`from_factors`. Rows must sum to one within the precision of
+    the given numbers; they are normalised to 64 bits.
     """
 
     __slots__ = ()
@@ -187,7 +187,7 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
 
     @staticmethod
     def from_probabilities(probabilities: ArrayLike) -> ObservationModel:
-        """From ``O(o | s, a)`` as ``[S, A, S, A]``; ``ValueError`` unless each truth's row sums to one."""
+        """Build from ``O(o | s, a)`` as ``[S, A, S, A]``; ``ValueError`` unless each row sums to one."""
         o = concrete("observation probabilities", probabilities)
         if o is None:
             return ObservationModel._make((safe_log(jnp.asarray(probabilities, float)),))
@@ -200,7 +200,7 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
 
     @staticmethod
     def from_factors(states: ArrayLike, actions: ArrayLike) -> ObservationModel:
-        """States and actions confused independently: ``O = O_s(o_s | s) O_a(o_a | a)``."""
+        """Build from independent confusions of states and actions: ``O = O_s(o_s | s) O_a(o_a | a)``."""
         factors = []
         for name, given in (("states", states), ("actions", actions)):
             table = concrete(f"the confusion of {name}", given, None)
@@ -214,7 +214,7 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
 
     @property
     def visibility(self) -> None:
-        """Noise hides nothing."""
+        """None: the noise hides no step."""
         return None
 
     @property
@@ -225,8 +225,8 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
     def log_likelihood(
         self, state: Int[Array, ""], action: Int[Array, ""], score: Float[Array, ""]
     ) -> Float[Array, "S A"]:
-        """``log O(o | s, a)`` of one report, for every truth; an unreported coordinate is summed out."""
-        del score  # a fixed confusion takes no account of confidence
+        """Return ``log O(o | s, a)`` of one observation for each truth; a hidden coordinate is summed out."""
+        del score  # fixed noise takes no account of confidence
         table = self.log_probabilities
         by_state = jnp.where(
             state == UNKNOWN, safe_log(jnp.sum(jnp.exp(table), axis=2)), table[:, :, jnp.maximum(state, 0)]
@@ -237,18 +237,18 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
     def report(
         self, key: Array, state: Int[Array, ""], action: Int[Array, ""]
     ) -> tuple[Int[Array, ""], Int[Array, ""]]:
-        """Draw what perception reports of a pair."""
+        """Draw the observation of a pair."""
         flat = jax.random.categorical(key, self.log_probabilities[state, action].reshape(-1))
         n_actions = self.log_probabilities.shape[1]
         return flat // n_actions, flat % n_actions
 
 
-# Row sums that differ from one by less than this are rounding: normalised, a table would lose its own bits.
+# Row sums that differ from one by less than this are rounding: normalising a table would change its bits.
 _KEPT = 1e-12
 
 
 def _row_sums(o: np.ndarray, given: Any) -> Float[np.ndarray, "S A 1 1"]:
-    """Sum ``o [S, A, S, A]``, made of what was given; ``ValueError`` unless each truth's row sums to one."""
+    """Sum ``o [S, A, S, A]`` over observations; ``ValueError`` unless each truth's row sums to one."""
     if o.ndim != 4 or o.shape[:2] != o.shape[2:]:
         raise ValueError(f"an observation model has shape [S, A, S, A], truth first, got {o.shape}")
     total = o.sum((2, 3), keepdims=True)
@@ -272,28 +272,28 @@ class _NoiseFields(NamedTuple):
 @shown_briefly
 @rebuilt_unchecked
 class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
-    """Noise on features of a pair (6.1): ``O(o | g)`` by the predicates that ``o`` and ``g`` agree on.
+    """Noise on features of a pair (6.1): ``O(o | g)`` depends on the predicates on which they agree.
 
     ``O(o | g) = prod_j p_j^[psi_j(o) = psi_j(g)] (1 - p_j)^[psi_j(o) != psi_j(g)] / Z(g)``, normalised over
-    the pairs ``o`` that can be reported; Eq. 6.5 is that without ``Z``. A reliability ``p_j`` is a parameter,
-    not a frequency: how often a predicate is reported rightly is :meth:`agreement`.
+    the pairs ``o`` that can be reported; Eq. 6.5 omits ``Z``. A reliability ``p_j`` is a parameter, not a
+    frequency: :meth:`agreement` is how often a predicate is reported rightly.
 
     Parameters
     ----------
     predicates : bool or int ``[J, S, A]``
-        ``psi_j(s, a)``. A predicate may be a label, such as the state's index: what counts is whether two
-        pairs have the same value.
+        ``psi_j(s, a)``. A predicate may be a label, such as the state's index: only the equality of two
+        pairs' values counts.
     reliabilities : float ``[J]``
-        ``p_j``, between 0 and 1; one half says nothing about its predicate.
+        ``p_j``, between 0 and 1; one half carries no information about its predicate.
     reportable : bool ``[S, A]``, optional
-        Which pairs perception may report; all of them by default, unavailable ones too: perception does not
-        know the task.
+        Pairs that perception may report; all of them by default, unavailable ones included, because
+        perception does not depend on the task.
 
     Raises
     ------
     ValueError
-        For predicates that are neither true or false nor whole numbers, reliabilities outside (0, 1), or
-        shapes that do not fit.
+        For predicates that are neither booleans nor whole numbers, reliabilities outside (0, 1), or shapes
+        that do not fit.
     """
 
     __slots__ = ()
@@ -335,7 +335,7 @@ class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
 
     @property
     def visibility(self) -> None:
-        """Noise hides nothing."""
+        """None: the noise hides no step."""
         return None
 
     @property
@@ -345,11 +345,11 @@ class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
 
     @property
     def log_probabilities(self) -> Float[Array, "S A S A"]:
-        """``log O(o | g)``, truth first; ``-inf`` for what cannot be reported."""
+        """``log O(o | g)``, truth first; ``-inf`` for pairs that cannot be reported."""
         n_predicates, *pairs = self.predicates.shape
         psi = self.predicates.reshape(n_predicates, -1)
         logits = jnp.log(self.reliabilities) - jnp.log1p(-self.reliabilities)
-        # Up to a term that no o changes: sum_j logit_j [psi_j(o) = psi_j(g)].
+        # Up to a term that is constant in o: sum_j logit_j [psi_j(o) = psi_j(g)].
         if psi.dtype == bool:
             true, false = psi.astype(float), (~psi).astype(float)
             exponents = (true * logits[:, None]).T @ true + (false * logits[:, None]).T @ false
@@ -359,7 +359,7 @@ class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
         return jax.nn.log_softmax(table, axis=1).reshape(*pairs, *pairs)
 
     def agreement(self) -> Float[Array, "J S A"]:
-        """Probability that each predicate of a report is that of the truth ``(s, a)``."""
+        """Probability that each predicate of an observation equals that of the truth ``(s, a)``."""
         psi = self.predicates.reshape(self.predicates.shape[0], -1)
         table = jnp.exp(self.log_probabilities).reshape(psi.shape[1], -1)
         same = jax.lax.map(lambda labels: jnp.sum(table, 1, where=labels[:, None] == labels), psi)
@@ -367,9 +367,9 @@ class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
 
 
 def _same_labels(psi: Int[Array, "J SA"], logits: Float[Array, " J"]) -> Float[Array, "SA SA"]:
-    """``sum_j logit_j [psi_j(o) = psi_j(g)]``, one predicate at a time, in its derivative too."""
+    """Compute ``sum_j logit_j [psi_j(o) = psi_j(g)]``, one predicate at a time, in its derivative too."""
 
-    # Kept for a derivative, who agrees with whom would be [J, SA, SA].
+    # A derivative that stores all agreements would take [J, SA, SA].
     @jax.checkpoint
     def add(total: Array, one: tuple[Array, Array]) -> tuple[Array, None]:
         labels, logit = one
@@ -379,7 +379,7 @@ def _same_labels(psi: Int[Array, "J SA"], logits: Float[Array, " J"]) -> Float[A
 
 
 def checked_predicates(predicates: ArrayLike) -> Bool[np.ndarray, "J S A"] | Int[np.ndarray, "J S A"]:
-    """Predicates as booleans if they are true or false, else as whole numbers; ``ValueError`` otherwise."""
+    """Convert predicates to booleans if possible, else to whole numbers; ``ValueError`` otherwise."""
     masked = isinstance(predicates, np.ma.MaskedArray)
     psi = np.asarray(concrete("predicates", predicates, None) if masked else predicates)
     if psi.ndim != 3 or not psi.size:
@@ -399,8 +399,8 @@ def checked_predicates(predicates: ArrayLike) -> Bool[np.ndarray, "J S A"] | Int
 def fitting_sensor(sensor: Any, mdp: TabularMDP) -> AnySensor:
     """Take a sensor, or a mask of the states in view, that fits the process.
 
-    Raises ``TypeError`` as :func:`as_sensor` does, and ``ValueError`` for a sensor that was made for another
-    number of states or actions than the MDP has.
+    Raises ``TypeError`` as :func:`as_sensor` does, and ``ValueError`` for a sensor whose number of states or
+    actions differs from the MDP's.
     """
     sensor = as_sensor(sensor)
     if sensor.visibility is not None and sensor.visibility.shape[-1:] != (mdp.n_states,):
@@ -423,7 +423,7 @@ def checked_demonstration(
     needed_by: str | None = None,
     record: str = "trajectory",
 ) -> Demonstration:
-    """Check that a demonstration is about the states and actions of a process; traced ones pass.
+    """Check that a demonstration fits the states and actions of a process; traced ones pass.
 
     Every learner, law and metric calls it before it compiles anything. Inside compiled programs
     :func:`step_log_evidence` gives such steps the probability zero.
@@ -431,7 +431,7 @@ def checked_demonstration(
     Parameters
     ----------
     needed_by : str, optional
-        Name of what cannot do without a single step ("a session"); empty demonstrations pass without.
+        Name of a caller that needs at least one step ("a session"); without it, empty demonstrations pass.
     record : str
         Name of a row in messages.
 
@@ -440,8 +440,8 @@ def checked_demonstration(
     TypeError
         For an object of another type.
     DemonstrationError
-        Naming trajectory and step: an index of no state or action, a kind that does not exist, a score
-        outside [0, 1], padding before a step; arrays of different shapes or of no whole numbers.
+        Naming trajectory and step: an index out of range, an unknown kind, a score outside [0, 1], padding
+        before a step; arrays of different shapes or not of whole numbers.
     """
     if not isinstance(demonstration, Demonstration):
         raise TypeError(
@@ -518,9 +518,9 @@ def step_log_evidence(
     action: Int[Array, ""],
     score: Float[Array, ""],
 ) -> Float[Array, "S A"]:
-    """``log e_t(s, a)`` of one step; zero (no evidence) for lost frames and padding.
+    """Return ``log e_t(s, a)`` of one step; zero (no evidence) for lost frames and padding.
 
-    Minus infinity for what cannot be perceived: an index of no state or action, or another kind.
+    The result is minus infinity for an index out of range and for an unknown kind.
     """
     shape = (n_states, n_actions)
     visibility = jnp.ones(n_states) if sensor.visibility is None else sensor.visibility
@@ -532,21 +532,21 @@ def step_log_evidence(
         noise = sensor.noise.log_likelihood(state, action, score)
     seen = noise + safe_log(visibility)[:, None]
     hidden = jnp.broadcast_to(safe_log(1 - visibility)[:, None], shape)
-    # An index beyond an array is clamped to its last entry: it would be learned from as another state.
+    # JAX clamps an index beyond an array to the last entry: the step would count as another state.
     in_range = (state >= UNKNOWN) & (state < n_states) & (action >= UNKNOWN) & (action < n_actions)
     nothing = jnp.where((kind == LOST) | (kind == PAD), jnp.zeros(shape), -jnp.inf)
     return jnp.where((kind == SEEN) & in_range, seen, jnp.where(kind == HIDDEN, hidden, nothing))
 
 
 def safe_log(probability: Array) -> Array:
-    """Logarithm with ``log 0 = -inf`` and a zero, not NaN, gradient there."""
+    """Take the logarithm with ``log 0 = -inf`` and a zero, not NaN, gradient there."""
     return jnp.where(probability > 0, jnp.log(jnp.where(probability > 0, probability, 1.0)), -jnp.inf)
 
 
 def log_evidence(sensor: AnySensor, mdp: TabularMDP, demonstration: Demonstration) -> Float[Array, "n L S A"]:
-    """``log e_t(s, a)`` of every step of every trajectory.
+    """Return ``log e_t(s, a)`` of every step of every trajectory.
 
-    Raises ``ValueError`` for a sensor made for another number of states or actions, and as
+    Raises ``ValueError`` for a sensor whose number of states or actions differs, and as
     :func:`checked_demonstration` does.
     """
     sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
@@ -558,7 +558,7 @@ def log_evidence(sensor: AnySensor, mdp: TabularMDP, demonstration: Demonstratio
 def observe(
     key: Array, sensor: AnySensor, states: Int[Array, " L"], actions: Int[Array, " L"]
 ) -> Int[Array, "L 3"]:
-    """Pass a true trajectory through a sensor: codes (kind, state, action) of what is perceived."""
+    """Pass a true trajectory through a sensor; return codes (kind, state, action) of the observations."""
 
     sensor = as_sensor(sensor)
 
@@ -584,8 +584,8 @@ def require_possible(
 ) -> None:
     """Raise :class:`DemonstrationError` at the first step that no behaviour of the MDP could have produced.
 
-    Follows the set of states that could still be true; ``record`` names what a row is in the message. An
-    index of no state or action is such a step too.
+    The check propagates the set of possible states; ``record`` names a row in messages. An index out of range
+    is such a step too.
     """
     sensor = fitting_sensor(sensor, mdp)
     demonstration = checked_demonstration(mdp, demonstration, record=record)

@@ -1,7 +1,7 @@
-"""Noisy perception of continuous tasks: recordings, and sensors that both distort them and weigh them.
+"""Noisy perception of continuous tasks: recordings, and sensors that both distort and weigh them.
 
-A sensor is one object with two faces. ``sample`` is the noise injector, ``log_prob`` the observation model of
-the same parameters (terms T4 and T5 of Eq. 6.10), so that what is put in and what is assumed cannot differ.
+A sensor has two methods with the same parameters: ``sample`` injects the noise, and ``log_prob`` is the
+observation model (terms T4 and T5 of Eq. 6.10). Injected and assumed noise therefore agree.
 """
 
 from __future__ import annotations
@@ -28,17 +28,17 @@ from ..inputs.display import (
 )
 
 MOUNTAIN_CAR_SHIFT = 0.1 * 1.8 / 10
-"""A tenth of a tenth of mountain car's range of positions, 1.8 (section 7.4.3)."""
+"""One percent of the range of positions of mountain car, 1.8 (section 7.4.3)."""
 
 
 class RecordingError(ValueError):
-    """A recording that cannot be used; the message names the trajectory and, where there is one, the step."""
+    """A recording that cannot be used; the message names the trajectory and, if there is one, the step."""
 
 
 class Recording(NamedTuple):
     """Trajectories in continuous spaces, padded to one length ``L``; step ``t`` is the pair ``(s_t, a_t)``.
 
-    The state after the last step is not part of it.
+    The state after the last step is not included.
 
     Fields
     ------
@@ -47,7 +47,7 @@ class Recording(NamedTuple):
     live : bool ``[n, L]``
         False on padding, which comes last.
     terminated : bool ``[n]``
-        Whether the task ended with the last step (rather than the recording alone).
+        True if the task ended with the last step, False if only the recording ended.
     """
 
     observations: Float[Array, "n L d"]
@@ -103,13 +103,13 @@ def recording(
     n_actions: int | None = None,
     length: int | None = None,
 ) -> Recording:
-    """Put trajectories together, one array ``[l, d]`` and one ``[l, k]`` (or ``[l]`` of integers) each.
+    """Build a recording of one array ``[l, d]`` and one ``[l, k]`` (or ``[l]`` of integers) per trajectory.
 
-    ``terminated`` defaults to none of them; ``n_actions`` bounds numbered actions; ``length`` pads to more
-    steps than the longest has, so that functions compiled for it serve later recordings as well.
+    ``terminated`` defaults to False throughout. ``n_actions`` bounds numbered actions. ``length`` pads beyond
+    the longest trajectory, so that functions compiled for it serve later recordings as well.
 
-    Raises :class:`RecordingError` naming the trajectory, and the step where there is one: numbers that are
-    not finite, shapes that do not fit each other, fewer than two steps, numbered actions that do not exist.
+    Raises :class:`RecordingError` naming the trajectory, and the step if there is one: numbers that are
+    not finite, shapes that do not fit each other, fewer than two steps, numbered actions out of range.
     """
     if len(observations) == 0 or len(observations) != len(actions):
         raise RecordingError(
@@ -193,10 +193,10 @@ def _check_trajectory(
 def require_recording(reported: Recording, observation_size: int, n_actions: int, action_size: int) -> None:
     """Raise :class:`RecordingError` for a recording that a learner of a task cannot take.
 
-    ``n_actions`` is their number, or 0 where they are vectors of ``action_size``. Looked at are the shapes,
-    numbers that are not finite (trajectory and step are named, padding included, as it passes through the
-    dynamics), actions that do not exist, padding between steps, and whether there is a step at all whose
-    successor or termination is known. Vectors beyond their bounds are fine: reports of noise are.
+    ``n_actions`` is their number, or 0 for vectors of ``action_size``. The check covers shapes, numbers that
+    are not finite (naming trajectory and step, padding included because it passes through the dynamics),
+    actions out of range, padding between steps, and that at least one step has a known successor or
+    termination. Vectors beyond their bounds pass, because noisy observations exceed them.
     """
     if not isinstance(reported, Recording):
         raise RecordingError(f"this learner learns from a Recording, got a {type(reported).__name__}")
@@ -240,19 +240,19 @@ def require_recording(reported: Recording, observation_size: int, n_actions: int
 
 
 class ContinuousSensor(Protocol):
-    """What reports of continuous states and actions are like, given the truth."""
+    """Noise of continuous states and actions: draws of observations, and their density given the truth."""
 
     def sample(self, key: Array, observations: Array, actions: Array) -> tuple[Array, Array]:
-        """Reports of true observations ``[..., d]`` and actions ``[..., k]`` or ``[...]``."""
+        """Draw observations of true states ``[..., d]`` and actions ``[..., k]`` or ``[...]``."""
 
     def log_prob(
         self, reported_observations: Array, reported_actions: Array, observations: Array, actions: Array
     ) -> Float[Array, "..."]:
-        """Log-density or log-probability of the reports, given the truth, ``[...]`` in nats."""
+        """Return the log-density or log-probability of observations given the truth, ``[...]`` in nats."""
 
 
 def require_continuous(sensor: Any) -> None:
-    """Raise ``TypeError`` for an object that neither samples reports nor weighs them."""
+    """Raise ``TypeError`` for an object that neither draws observations nor weighs them."""
     if isinstance(sensor, type) or not any(hasattr(sensor, x) for x in ("sample", "log_prob", "candidates")):
         raise TypeError(
             "sensor must be one of continuous recordings, such as GaussianSensor(0.1, 0.1) or ShiftSensor(); "
@@ -261,7 +261,7 @@ def require_continuous(sensor: Any) -> None:
 
 
 def distort(key: Array, sensor: ContinuousSensor, truth: Recording) -> Recording:
-    """Replace a recording by what the sensor reports of it; padding stays as it is."""
+    """Replace a recording by the sensor's observations of it; padding is unchanged."""
     require_continuous(sensor)
     observations, actions = sensor.sample(as_key(key), truth.observations, truth.actions)
     live = truth.live[..., None]
@@ -279,13 +279,13 @@ class _GaussianFields(NamedTuple):
 @shown_briefly
 @rebuilt_unchecked
 class GaussianSensor(_GaussianFields):
-    """Reports normal about the truth, states and actions independently (section 6.2.3, Technique 2).
+    """Gaussian noise, independent for states and actions (section 6.2.3, Technique 2).
 
-    Reports are not cut to the spaces' bounds, so density and frequencies agree everywhere.
+    Observations are not clipped to the spaces' bounds, so density and frequencies agree everywhere.
 
     Parameters
     ----------
-    state_covariance : float ``[d, d]``, ``[d]`` (the diagonal) or a number (every component's variance)
+    state_covariance : float ``[d, d]``, ``[d]`` (the diagonal) or a number (every coordinate's variance)
     action_covariance : float ``[k, k]``, ``[k]`` or a number; likewise
 
     Raises
@@ -297,7 +297,7 @@ class GaussianSensor(_GaussianFields):
     __slots__ = ()
 
     def __new__(cls, state_covariance: ArrayLike, action_covariance: ArrayLike) -> GaussianSensor:
-        """Check and convert both."""
+        """Check and convert both covariances."""
         return super().__new__(
             cls,
             checked_covariance("state", state_covariance),
@@ -305,7 +305,7 @@ class GaussianSensor(_GaussianFields):
         )
 
     def sized(self, observation_size: int, action_size: int) -> GaussianSensor:
-        """The same with matrices ``[d, d]`` and ``[k, k]``; ``ValueError`` where the sizes differ."""
+        """Expand the covariances to ``[d, d]`` and ``[k, k]``; ``ValueError`` if the sizes differ."""
         return GaussianSensor._make(
             (
                 covariance_matrix("state", self.state_covariance, observation_size),
@@ -316,11 +316,11 @@ class GaussianSensor(_GaussianFields):
     def sample(
         self, key: Array, observations: Float[Array, "... d"], actions: Float[Array, "... k"]
     ) -> tuple[Float[Array, "... d"], Float[Array, "... k"]]:
-        """Reports of true observations and actions; ``ValueError`` where the actions are no vectors."""
+        """Draw observations of true states and actions; ``ValueError`` if the actions are not vectors."""
         if actions.ndim != observations.ndim:
             raise ValueError(
-                f"normal noise is of vectors of actions [..., k]; got {actions.shape} beside observations "
-                f"{observations.shape}"
+                f"Gaussian noise needs action vectors [..., k]; got shape {actions.shape} beside "
+                f"observations {observations.shape}"
             )
         sensor = self.sized(observations.shape[-1], actions.shape[-1])
         key_s, key_a = jax.random.split(key)
@@ -336,7 +336,7 @@ class GaussianSensor(_GaussianFields):
         observations: Float[Array, "... d"],
         actions: Float[Array, "... k"],
     ) -> Float[Array, "..."]:
-        """Log-density of the reports, in nats."""
+        """Return the log-density of observations, in nats."""
         sensor = self.sized(observations.shape[-1], actions.shape[-1])
         return log_normal(reported_observations - observations, sensor.state_covariance) + log_normal(
             reported_actions - actions, sensor.action_covariance
@@ -346,7 +346,7 @@ class GaussianSensor(_GaussianFields):
 def checked_covariance(whose: str, given: Any) -> Any:
     """Convert a covariance (number, diagonal or matrix) to an array; traced ones pass unchecked.
 
-    Raises ``ValueError`` where it is not finite, not symmetric or not positive definite.
+    Raises ``ValueError`` if it is not finite, not symmetric or not positive definite.
     """
     array = concrete(f"the {whose} covariance", given)
     if array is None:
@@ -371,7 +371,7 @@ def checked_covariance(whose: str, given: Any) -> Any:
 
 
 def covariance_matrix(whose: str, covariance: Array, size: int) -> Float[Array, "size size"]:
-    """The matrix that a number or a diagonal stands for; ``ValueError`` where its size is another."""
+    """Expand a number or a diagonal to a matrix; ``ValueError`` if its size is another."""
     if covariance.ndim and covariance.shape[-1] != size:
         raise ValueError(
             f"the {whose} covariance has shape {covariance.shape}, but there are {size} components"
@@ -384,7 +384,7 @@ def _normal(key: Array, covariance: Float[Array, "d d"], shape: tuple[int, ...])
 
 
 def log_normal(difference: Float[Array, "... d"], covariance: Float[Array, "d d"]) -> Float[Array, "..."]:
-    """Log-density at a difference from the mean, in nats."""
+    """Return the log-density at a difference from the mean, in nats."""
     factor = jnp.linalg.cholesky(covariance)
     whiten = jax.scipy.linalg.solve_triangular(factor, jnp.eye(len(factor)), lower=True)
     z = difference @ whiten.T
@@ -400,12 +400,12 @@ class _ShiftFields(NamedTuple):
 @shown_briefly
 @rebuilt_unchecked
 class ShiftSensor(_ShiftFields):
-    """Mountain car's noise: the position is now and then reported further along in the action's direction.
+    """Mountain car's noise: an observed position is sometimes shifted along the action's direction.
 
-    With ``probability`` the first component is reported ``shift`` lower for actions 0 and 1 and ``shift``
-    higher for action 2; otherwise, and in all else, the report is the truth (section 7.4.3, whose 0.75
-    "otherwise" is read as the truth, the only reading that sums to one). Positions are not cut to the
-    track, so each truth has two reports wherever it lies; ``log_prob`` is that of the report among the two.
+    With ``probability`` the first coordinate is observed ``shift`` lower for actions 0 and 1 and ``shift``
+    higher for action 2; otherwise the observation is the truth. (Section 7.4.3 gives its 0.75 to
+    "otherwise"; only this interpretation sums to one.) Positions are not clipped to the track, so each truth
+    has two possible observations everywhere; ``log_prob`` covers both.
 
     Parameters
     ----------
@@ -423,7 +423,7 @@ class ShiftSensor(_ShiftFields):
     def __new__(
         cls, shift: float | Array = MOUNTAIN_CAR_SHIFT, probability: float | Array = 0.25
     ) -> ShiftSensor:
-        """Check both."""
+        """Check both parameters."""
         by, p = concrete("shift", shift), concrete("probability", probability)
         if by is not None and not (by.ndim == 0 and np.isfinite(by)):
             raise ValueError(f"shift must be a finite number; got {described(shift)}")
@@ -432,13 +432,13 @@ class ShiftSensor(_ShiftFields):
         return super().__new__(cls, shift, probability)
 
     def displacement(self, actions: Array) -> Float[Array, "..."]:
-        """What a distorted report adds to the position, ``[...]``."""
+        """Return the shift that a distorted observation adds to the position, ``[...]``."""
         return jnp.where(actions == 2, self.shift, -jnp.asarray(self.shift))
 
     def sample(
         self, key: Array, observations: Float[Array, "... d"], actions: Array
     ) -> tuple[Float[Array, "... d"], Array]:
-        """Reports of true observations and (numbered) actions."""
+        """Draw observations of true states and (numbered) actions."""
         shifted = jax.random.bernoulli(key, self.probability, actions.shape)
         moved = observations[..., 0] + jnp.where(shifted, self.displacement(actions), 0.0)
         return observations.at[..., 0].set(moved), actions
@@ -450,7 +450,7 @@ class ShiftSensor(_ShiftFields):
         observations: Float[Array, "... d"],
         actions: Array,
     ) -> Float[Array, "..."]:
-        """Log-probability of the reports, in nats; equal means within 1e-6 (32-bit numbers)."""
+        """Return the log-probability of observations, in nats; equal means within 1e-6 (32-bit numbers)."""
         difference = reported_observations - observations
         same = (reported_actions == actions) & jnp.all(jnp.abs(difference[..., 1:]) < 1e-6, -1)
         true = jnp.abs(difference[..., 0]) < 1e-6
@@ -463,9 +463,9 @@ class ShiftSensor(_ShiftFields):
     def candidates(
         self, reported_observations: Float[Array, "... d"], reported_actions: Array
     ) -> tuple[Float[Array, "... 2 d"], Float[Array, "... 2"]]:
-        """Everything that may be behind a report, the report itself first, and what each makes of it.
+        """List the truths that may be behind an observation, the observation itself first.
 
-        Returns the truths and the log-probability, in nats, that each would be reported so.
+        Returns them with the log-probability, in nats, of the observation given each.
         """
         back = self.displacement(reported_actions)
         shifted = reported_observations.at[..., 0].add(-back)
@@ -475,28 +475,28 @@ class ShiftSensor(_ShiftFields):
 
 
 class FiniteSensor(Protocol):
-    """A sensor behind each report of which there are finitely many truths; actions it reports as they are."""
+    """A sensor with finitely many possible truths behind each observation; it observes actions exactly."""
 
     def candidates(
         self, reported_observations: Float[Array, "... d"], reported_actions: Array
     ) -> tuple[Float[Array, "... K d"], Float[Array, "... K"]]:
-        """The truths, and the log-probability that each would be reported so."""
+        """Return the truths, and the log-probability of the observation given each."""
 
 
 @shown_briefly
 class Truths(NamedTuple):
-    """Draws of what may have happened behind a recording, ``M`` of them, usable as an expert's transitions.
+    """Draws of the truth behind a recording, ``M`` of them, usable as an expert's transitions.
 
     Fields
     ------
     observations : float ``[M, n, L, d]``
     actions : float ``[M, n, L, k]`` or int ``[M, n, L]``
     successors : float ``[M, n, L, d]``
-        The draw's own next state; where there is none, the state itself.
+        The draw's own next state; the state itself if there is none.
     terminated : bool ``[M, n, L]``
         The last step of a trajectory that ended.
     usable : bool ``[M, n, L]``
-        Steps that have a successor or terminated; the rest must not be learned from.
+        Steps that have a successor or terminated; learners must skip the rest.
     """
 
     observations: Float[Array, "M n L d"]
@@ -507,7 +507,7 @@ class Truths(NamedTuple):
 
 
 def truths(reported: Recording, observations: Float[Array, "M n L d"], actions: Array) -> Truths:
-    """Put draws of states and actions together as transitions."""
+    """Combine draws of states and actions into transitions."""
     following = jnp.concatenate([observations[:, :, 1:], observations[:, :, -1:]], 2)
     followed = jnp.broadcast_to(reported.followed, observations.shape[:-1])
     ended = jnp.broadcast_to(reported.last & reported.terminated[:, None], followed.shape)

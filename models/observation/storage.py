@@ -17,27 +17,33 @@ from .evidence import Visibility
 _ARRAYS = ("successors", "probabilities", "features", "initial", "discount", "available")
 _NAMES = ("states", "actions", "feature_names")
 _KINDS = {
-    "successors": "iu", "probabilities": "fiu", "features": "fiub", "initial": "fiu", "discount": "fiu",
-    "available": "b", "in_view": "fiub", **dict.fromkeys(_NAMES, "Uiu"),
-}  # fmt: skip
+    "successors": "iu",
+    "probabilities": "fiu",
+    "features": "fiub",
+    "initial": "fiu",
+    "discount": "fiu",
+    "available": "b",
+    "in_view": "fiub",
+    **dict.fromkeys(_NAMES, "Uiu"),
+}
 
 
 @shown_briefly
 class StoredMDP(NamedTuple):
-    """An MDP read from a file, and the learner's view ``[S]`` if the file has one."""
+    """An MDP read from a file, and the learner's visibility ``[S]`` if the file has one."""
 
     mdp: TabularMDP
     in_view: Float[np.ndarray, " S"] | None
 
 
 def save_mdp(path: str | os.PathLike[str], mdp: TabularMDP, in_view: np.ndarray | None = None) -> None:
-    """Write an MDP, and optionally a view (mask or probabilities ``[S]``), to an ``.npz`` file.
+    """Write an MDP, and optionally a visibility (mask or probabilities ``[S]``), to an ``.npz`` file.
 
     The arrays ``successors``, ``probabilities`` (``[S, A, B]``), ``features`` ``[S, A, K]``, ``initial``
     ``[S]``, ``discount`` and ``available`` ``[S, A]`` are those of :meth:`TabularMDP.from_successors`;
-    ``states``, ``actions`` and ``feature_names`` hold names where there are any. Raises ``ValueError`` for a
-    path that does not end in ``.npz`` (NumPy would add it), a view of the wrong shape or outside [0, 1], and
-    names that end in a NUL character (NumPy would drop it).
+    ``states``, ``actions`` and ``feature_names`` hold names if there are any. Raises ``ValueError`` for a
+    path that does not end in ``.npz`` (NumPy would add it), visibility of the wrong shape or outside [0, 1],
+    and names that end in a NUL character (NumPy would drop it).
     """
     if not isinstance(mdp, TabularMDP):
         raise TypeError(f"mdp must be a TabularMDP; got {shortened(mdp)}")
@@ -59,12 +65,12 @@ def save_mdp(path: str | os.PathLike[str], mdp: TabularMDP, in_view: np.ndarray 
 
 
 def load_mdp(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> StoredMDP:
-    """Read what :func:`save_mdp` wrote, or an archive made by other means with the same arrays.
+    """Read a file of :func:`save_mdp`, or any archive with the same arrays.
 
     Only ``successors``, ``probabilities`` and ``features`` are required. The arrays are checked by their
     headers before they are read, and may take ``max_bytes`` in all (1 GiB by default); building the process
     takes about three times their size. Raises :class:`StorageError` (a ``ValueError``) naming the file and
-    what is wrong with it, ``OSError`` if it cannot be opened.
+    the fault, and ``OSError`` if the file cannot be opened.
     """
     arrays = read_arrays(path, _KINDS, required=_ARRAYS[:3], what="MDP archive", max_bytes=max_bytes)
     try:

@@ -1,4 +1,4 @@
-"""The decision process an expert acts in, without its reward."""
+"""The decision process of an expert, without its reward."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from ..inputs.display import brief, brief_repr, brief_table, fields_of
 from ..inputs.probabilities import normalised, sum_tolerance
 from ..inputs.text import listed, shortened
 
-# Gathering from predecessors beats scattering to successors on a CPU while no state has far more
+# Gathering from predecessors beats scattering to successors on a CPU unless some state has far more
 # predecessors than the average; past this ratio (an absorbing sink, say) the padding costs more.
 _MAX_INFLOW_RATIO = 6
-# Nor does the table pay on its own where states are so many that nobody maps over a batch of such processes:
-# there scattering is 3 times faster (6 ms against 18 at 300 000 states).
+# For very many states, whose processes nobody batches, the table does not pay either: there scattering is
+# 3 times faster (6 ms against 18 at 300 000 states).
 _MAX_INFLOW_STATES = 10_000
 _SURROGATE = re.compile("[\ud800-\udfff]")
 
@@ -39,7 +39,7 @@ class Labels:
     _hash: int = field(init=False, repr=False, compare=False, default=0)
 
     def __post_init__(self) -> None:
-        # Hashed once: a compiled function looks its static arguments up at every call.
+        # Hashed once: a compiled function looks up its static arguments at every call.
         object.__setattr__(self, "_hash", hash((self.states, self.actions, self.features)))
 
     def __hash__(self) -> int:
@@ -53,24 +53,31 @@ class Labels:
         return (self.states, self.actions, self.features) == (other.states, other.actions, other.features)
 
     def __reduce__(self) -> tuple:
-        # Hashes of strings differ between processes: rebuild rather than carry one over.
+        # Hashes of strings differ between processes: rebuild them.
         return Labels, (self.states, self.actions, self.features)
 
 
 @partial(
     jax.tree_util.register_dataclass,
     data_fields=[
-        "successors", "probabilities", "features", "initial", "discount", "available",
-        "inflow_pairs", "inflow_slots",
+        "successors",
+        "probabilities",
+        "features",
+        "initial",
+        "discount",
+        "available",
+        "inflow_pairs",
+        "inflow_slots",
     ],
     meta_fields=["labels"],
-)  # fmt: skip
+)
 @dataclass(frozen=True, eq=False)
 class TabularMDP:
     """A finite MDP without a reward, ``<S, A, P, phi, gamma, p0>`` (Definition 1), as successor lists.
 
     Built by :meth:`from_successors`, :meth:`from_dense` or :meth:`from_sparse`, which check it once;
-    immutable, and a JAX pytree, so it passes through ``jit``, ``vmap`` and ``grad``. Compared by identity;
+    immutable, and a JAX pytree, so it passes through ``jit``, ``vmap`` and ``grad``. Comparison is by
+    identity;
     :meth:`fingerprint` compares contents.
 
     Attributes
@@ -86,11 +93,12 @@ class TabularMDP:
     discount : float scalar
         ``gamma`` in (0, 1]; 1 only for finite horizons.
     available : bool ``[S, A]``
-        Which actions exist in which state.
+        The actions that exist in each state.
     inflow_pairs, inflow_slots : int ``[S, M]`` or None
-        The same transitions seen from the state they lead to: flat indices of the pair and of the entry of
-        ``probabilities`` (-1 on padding). Kept up to 10 000 states where no state has far more predecessors
-        than the average. The numbers are in ``probabilities`` alone, so that a derivative finds them all.
+        The same transitions indexed by the state they lead to: flat indices of the pair and of the entry of
+        ``probabilities`` (-1 on padding). Stored up to 10 000 states unless some state has far more
+        predecessors than the average. The numbers are in ``probabilities`` alone, so that a derivative covers
+        all of them.
     labels : Labels
         Names.
     """
@@ -124,11 +132,11 @@ class TabularMDP:
 
         ``initial`` defaults to uniform, ``available`` to every pair. Probabilities may sum to one within the
         precision of their type (:func:`~i2rl.models.inputs.probabilities.sum_tolerance`). Those of
-        ``initial``, and those of transitions shorter than 64 bits, are then divided by their sum; what sums
-        to one within 64-bit rounding keeps its bits. Raises ``ValueError`` that names the state, action or
-        feature at fault: probabilities that are negative, NaN or do not sum to one, successors that are no
-        states, features of the wrong shape or not finite, a discount outside (0, 1], a state with no
-        available action, names of the wrong number or repeated.
+        ``initial``, and those of transitions shorter than 64 bits, are then divided by their sum; sums within
+        64-bit rounding of one keep their bits. Raises ``ValueError`` naming the state, action or feature at
+        fault: probabilities that are negative, NaN or do not sum to one, successors out of range, features of
+        the wrong shape or not finite, a discount outside (0, 1], a state with no available action, names of
+        the wrong number or repeated.
         """
         successors = np.asarray(successors)
         given = np.asarray(probabilities)
@@ -182,9 +190,9 @@ class TabularMDP:
                 f"initial must be a distribution over states: its least value is {initial.min()}, "
                 f"its sum {total}"
             )
-        # Unavailable pairs lead nowhere: they keep their place with zero probability and zero features.
+        # Unavailable pairs keep their place with zero probability and zero features.
         probabilities = np.where(available[..., None], probabilities, 0.0)
-        if tolerance > sum_tolerance(float, 1):  # they were given in fewer than 64 bits
+        if tolerance > sum_tolerance(float, 1):  # given in fewer than 64 bits
             probabilities = normalised(probabilities)
         features = np.where(available[..., None], features, 0.0)
         successors = np.where(probabilities > 0, successors, np.arange(n_states)[:, None, None]).astype(
@@ -221,8 +229,8 @@ class TabularMDP:
     ) -> TabularMDP:
         """Build an MDP from SciPy-sparse transitions.
 
-        Either one matrix ``[S * A, S]`` whose row ``s * A + a`` is the distribution after pair ``(s, a)``,
-        or a sequence of ``A`` matrices ``[S, S]``. Options as for :meth:`from_successors`.
+        The transitions are one matrix ``[S * A, S]`` whose row ``s * A + a`` is the distribution after pair
+        ``(s, a)``, or a sequence of ``A`` matrices ``[S, S]``. Options as for :meth:`from_successors`.
         """
         if not sparse.issparse(transitions):
             blocks = [sparse.csr_array(block) for block in transitions]
@@ -234,7 +242,7 @@ class TabularMDP:
             stacked = sparse.vstack(blocks, format="csr")
             rows = stacked[np.arange(n_states * n_actions).reshape(n_actions, n_states).T.ravel()]
         else:
-            # A copy: merging duplicates works in place, and the caller's matrix is the caller's.
+            # A copy: merging duplicates works in place and would change the caller's matrix.
             rows = sparse.csr_array(transitions, copy=True)
             n_states = rows.shape[1]
             if n_states == 0 or rows.shape[0] % n_states:
@@ -302,15 +310,21 @@ class TabularMDP:
     def fingerprint(self) -> str:
         """Digest everything that defines this MDP, in hexadecimal; equal exactly for equal MDPs.
 
-        The start enters divided by its sum, as MDPs once kept it: journals remember these digests.
+        The initial distribution enters divided by its sum, as older versions stored it: journals hold such
+        digests.
         """
         initial = np.asarray(self.initial)
         if sum_tolerance(initial.dtype, initial.size) >= abs(initial.sum() - 1):
             initial = initial / initial.sum()
         digest = hashlib.sha256()
         for leaf in (
-            self.successors, self.probabilities, self.features, initial, self.discount, self.available,
-        ):  # fmt: skip
+            self.successors,
+            self.probabilities,
+            self.features,
+            initial,
+            self.discount,
+            self.available,
+        ):
             array = np.ascontiguousarray(leaf)
             digest.update(f"{array.dtype}{array.shape}".encode())
             digest.update(array.tobytes())
@@ -318,15 +332,15 @@ class TabularMDP:
         return digest.hexdigest()
 
     def with_initial(self, initial: Float[Array, " S"]) -> TabularMDP:
-        """The same process started elsewhere (unchecked, so that it works under a trace)."""
+        """Replace the initial distribution (unchecked, so that it works under a trace)."""
         return replace(self, initial=initial)
 
     def with_probabilities(self, probabilities: Float[Array, "S A B"]) -> TabularMDP:
-        """The same successors with other chances (unchecked, so that it works under a trace)."""
+        """Replace the probabilities of the same successors (unchecked, so that it works under a trace)."""
         return replace(self, probabilities=probabilities)
 
     def without_inflow(self) -> TabularMDP:
-        """The same process without its inflow table, whose width differs between processes of one size."""
+        """Drop the inflow table, whose width differs between processes of one size."""
         return replace(self, inflow_pairs=None, inflow_slots=None)
 
     # -- the two directions of the dynamics -----------------------------------------------------------
@@ -339,29 +353,29 @@ class TabularMDP:
         return jnp.where(self.inflow_slots < 0, 0.0, self.probabilities.reshape(-1)[self.inflow_slots])
 
     def expect_next(self, values: Float[Array, " S"]) -> Float[Array, "S A"]:
-        """Expected value after each pair, ``sum_s' P(s' | s, a) v(s')``."""
+        """Return the expected value after each pair, ``sum_s' P(s' | s, a) v(s')``."""
         return jnp.einsum("sab,sab->sa", self.probabilities, values[self.successors])
 
     def push_forward(self, pairs: Float[Array, "S A"]) -> Float[Array, " S"]:
-        """Mass on the next state from mass on pairs, ``sum_{s, a} x(s, a) P(s' | s, a)``."""
+        """Return mass on the next state from mass on pairs, ``sum_{s, a} x(s, a) P(s' | s, a)``."""
         if self.inflow_pairs is not None:
             return jnp.einsum("sm,sm->s", self.inflow_probabilities, pairs.reshape(-1)[self.inflow_pairs])
         flow = pairs[..., None] * self.probabilities
         return jax.ops.segment_sum(flow.reshape(-1), self.successors.reshape(-1), self.n_states)
 
     def transition_probability(self, state: Int[Array, ""]) -> Float[Array, "S A"]:
-        """Probability of reaching ``state`` from each pair, ``P(state | s, a)``."""
+        """Return the probability of reaching ``state`` from each pair, ``P(state | s, a)``."""
         return jnp.sum(jnp.where(self.successors == state, self.probabilities, 0.0), axis=-1)
 
     def state_transitions(self, policy: Float[Array, "S A"]) -> Float[Array, "S S"]:
-        """The Markov chain of a policy as a dense matrix ``[S, S]`` (small state spaces only)."""
+        """Return the Markov chain of a policy as a dense matrix ``[S, S]`` (small state spaces only)."""
         flow = policy[..., None] * self.probabilities
         rows = jnp.broadcast_to(jnp.arange(self.n_states)[:, None, None], self.successors.shape)
         return jnp.zeros((self.n_states, self.n_states)).at[rows, self.successors].add(flow)
 
 
 def _real(name: str, given: Any) -> Float[np.ndarray, "..."]:
-    """The numbers as 64-bit floats."""
+    """Convert the numbers to 64-bit floats."""
     array = np.asarray(given)
     if array.dtype.kind == "c":
         raise ValueError(f"{name} must be real numbers; got {array.dtype}")
@@ -369,7 +383,7 @@ def _real(name: str, given: Any) -> Float[np.ndarray, "..."]:
 
 
 def _from_rows(rows: sparse.csr_array, dtype: np.dtype, features: np.ndarray, **options: Any) -> TabularMDP:
-    """The MDP of a row of ``[S * A, S]`` for each pair, whose probabilities were given in ``dtype``."""
+    """Build the MDP from a row of ``[S * A, S]`` per pair, whose probabilities were given in ``dtype``."""
     rows.sum_duplicates()
     counts = np.diff(rows.indptr)
     width = max(int(counts.max(initial=0)), 1)
@@ -480,7 +494,7 @@ def _check_transitions(
 
 
 def _inflow(successors: np.ndarray, available: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Pairs and entries that lead to each state; entries of probability zero too, which have derivatives."""
+    """List the pairs and entries that lead to each state, those of probability zero included."""
     n_states, _, width = successors.shape
     if n_states > _MAX_INFLOW_STATES:
         return None

@@ -1,13 +1,13 @@
-"""Planning: what an expert with a given reward would do, and what would come of it.
+"""Planning: policies of a given reward, and their values, occupancies and feature expectations.
 
 Soft (maximum causal entropy; Ziebart 2010) and hard planning, over an infinite discounted or a finite
-horizon; values, occupancies and feature expectations of a policy. Soft plans and everything computed of a
-policy are differentiable in the reward, the transition probabilities and the discount, over an infinite
-horizon by the implicit function theorem: no unrolling.
+horizon. Soft plans and all quantities of a policy are differentiable in the reward, the transition
+probabilities and the discount, over an infinite horizon by the implicit function theorem (no unrolling).
 
-A reward or a policy that is not a number is refused with its state and action where there are numbers to look
-at, and makes every result NaN where JAX traces it. Each function checks its arguments and then calls a
-compiled one, so that a call outside ``jit`` compiles for a new shape only.
+A NaN in a reward or a policy raises an error that names its state and action. If JAX traces the table, NaN
+makes every result NaN.
+Each function checks its arguments and then calls a compiled
+one, so that a call outside ``jit`` compiles for a new shape only.
 """
 
 from __future__ import annotations
@@ -29,10 +29,10 @@ from .mdp import PairNames, TabularMDP
 
 # Up to here a dense [S, S] factorisation beats Krylov iterations (0.1 ms at 124 states, 12 ms at 1024).
 DIRECT_LIMIT = 1500
-# Policy iteration takes a handful of steps as a rule, but may take one a state on a corridor whose moves
-# cost more than a distant reward is worth at first sight.
+# Policy iteration usually takes a handful of steps, but may take one per state on a corridor whose moves
+# cost more than a distant reward is worth at first.
 _MAX_STEPS = 20_000
-# Work of one accelerated step: this many backups, or Krylov iterations that must gain more than they would.
+# Work of one accelerated step: this many backups, or Krylov iterations that must gain more than these.
 _BACKUPS = 50
 _EPS = float(jnp.finfo(jnp.float64).eps)
 
@@ -76,7 +76,7 @@ class SoftPlan(NamedTuple):
 
 @shown_briefly
 class HardPlan(NamedTuple):
-    """Solution of the Bellman optimality equations, with every optimal action kept."""
+    """Solution of the Bellman optimality equations, with all optimal actions."""
 
     values: Float[Array, " S"]
     action_values: Float[Array, "S A"]
@@ -84,7 +84,7 @@ class HardPlan(NamedTuple):
 
 
 def reward_of(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """Reward ``theta . phi(s, a)`` of every pair. Raises ``ValueError`` for a weight of NaN."""
+    """Return the reward ``theta . phi(s, a)`` of every pair. Raises ``ValueError`` for a weight of NaN."""
     if not is_traced(weights) and np.isnan(np.asarray(weights)).any():
         k = int(np.argwhere(np.isnan(np.asarray(weights)))[0, 0])
         raise ValueError(
@@ -96,7 +96,7 @@ def reward_of(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A
 def action_values(
     mdp: TabularMDP, reward: Float[Array, "S A"], values: Float[Array, " S"]
 ) -> Float[Array, "S A"]:
-    """``Q(s, a) = r(s, a) + gamma sum_s' P(s' | s, a) V(s')``; ``-inf`` where the action is unavailable."""
+    """Return ``Q(s, a) = r(s, a) + gamma sum_s' P(s' | s, a) V(s')``; ``-inf`` for unavailable actions."""
     return jnp.where(mdp.available, reward + mdp.discount * mdp.expect_next(values), -jnp.inf)
 
 
@@ -127,10 +127,10 @@ def soft_plan(
 ) -> SoftPlan:
     """Solve the soft Bellman equations over an infinite discounted horizon.
 
-    ``start [S]`` warm-starts the values. Newton's method (soft policy iteration), with direct solves up to
-    ``DIRECT_LIMIT`` states and Krylov solves beyond; to about 1e-12 of the values' scale, or as well as
-    rounding allows where the discount is above 0.99. Raises ``ValueError`` for discount 1 and a
-    reward of NaN; where the reward is traced, NaN makes the whole plan NaN.
+    ``start [S]`` warm-starts the values. Newton's method (soft policy iteration) uses direct solves up to
+    ``DIRECT_LIMIT`` states and Krylov solves beyond. Its precision is about 1e-12 of the values' scale, or
+    rounding if the discount is above 0.99. Raises ``ValueError`` for discount 1 and a reward of NaN; in a
+    traced reward, NaN makes the whole plan NaN.
     """
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
@@ -149,7 +149,7 @@ def _soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], start: Float[Array,
 def soft_backup(
     mdp: TabularMDP, reward: Float[Array, "S A"], values: Float[Array, " S"]
 ) -> Float[Array, " S"]:
-    """One sweep of the soft Bellman equations, ``log sum_a exp(r + gamma P values)``."""
+    """Apply the soft Bellman equations once, ``log sum_a exp(r + gamma P values)``."""
     return jax.nn.logsumexp(action_values(mdp, reward, values), axis=1)
 
 
@@ -177,7 +177,7 @@ def hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: float = 1
 
     ``tolerance`` is relative to the spread of the values. Policy iteration, with direct solves up to
     ``DIRECT_LIMIT`` states and Krylov solves beyond. Raises ``ValueError`` for discount 1 and a reward of
-    NaN; where the reward is traced, NaN makes all values NaN and no action optimal.
+    NaN; in a traced reward, NaN makes all values NaN and no action optimal.
     """
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
@@ -202,20 +202,20 @@ def _hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: Float[Ar
 
 
 def greedy_actions(q: Float[Array, "S A"], tolerance: float | Array = 1e-9) -> Bool[Array, "S A"]:
-    """Every action whose value is within ``tolerance`` (relative to the values' spread) of the best."""
+    """Mark every action whose value is within ``tolerance`` (relative to the values' spread) of the best."""
     best = jnp.max(q, axis=1, keepdims=True)
     finite = jnp.where(jnp.isfinite(q), q, best)
     return q >= best - tolerance * (1 + jnp.max(finite) - jnp.min(finite))
 
 
 def deterministic_policy(optimal: Bool[Array, "S A"]) -> Float[Array, "S A"]:
-    """Policy that takes the first optimal action of each state with certainty; NaN where none is optimal."""
+    """Return the policy of the first optimal action of each state; NaN if a state has none."""
     first = jax.nn.one_hot(jnp.argmax(optimal, axis=1), optimal.shape[1])
     return jnp.where(jnp.any(optimal, axis=1, keepdims=True), first, jnp.nan)
 
 
 def _precision(discount: Float[Array, ""]) -> Float[Array, ""]:
-    """Residual, relative to the solution, that places it within 1e-12, or that rounding alone may leave."""
+    """Return the residual, relative to the solution, for a precision of 1e-12 or of rounding."""
     return jnp.maximum(1e-12 * (1 - discount), 16 * _EPS)
 
 
@@ -240,7 +240,7 @@ def _policy_iteration(
     def unfinished(carry: tuple) -> Bool[Array, ""]:
         values, _, gap, before, step = carry
         left, scale = _largest(gap), 1 + _largest(values)
-        # Sums over many successors round further: there, what no longer shrinks is rounding.
+        # Sums over many successors have larger rounding errors: a residual that stops shrinking is rounding.
         rounding = (left < 1e-13 * scale) & (left > before / 2)
         return (left > _precision(mdp.discount) * scale) & ~rounding & (step < _MAX_STEPS)
 
@@ -253,7 +253,7 @@ def _largest(x: Float[Array, " S"]) -> Float[Array, ""]:
 
 
 def _if_numbers(gap: Float[Array, " S"], solution: Float[Array, " S"]) -> Float[Array, " S"]:
-    # No comparison with NaN holds, so that an iteration ends at once and where it began.
+    # Comparisons with NaN are false, so an iteration ends at once at its start.
     return jnp.where(jnp.isnan(_largest(gap)), jnp.nan, solution)
 
 
@@ -265,11 +265,11 @@ def _fixed_point(
     forcing: float = 1e-2,
     floor: float = 0.0,
 ) -> Float[Array, " S"]:
-    """Fixed point of a backup that contracts by ``discount`` in the norm ``size``.
+    """Find the fixed point of a backup that contracts by ``discount`` in the norm ``size``.
 
     Inexact Newton: each step solves the linearised equation by BiCGSTAB to the relative residual
-    ``forcing``. A step that gains less than ``_BACKUPS`` plain backups would is replaced by them, so that
-    convergence needs at most a few times the work of successive approximation, whatever the chain.
+    ``forcing``. A step that gains less than ``_BACKUPS`` plain backups would is replaced by them. Convergence
+    then needs at most a few times the work of successive approximation, whatever the chain.
     Precision is relative to ``floor`` plus the size of the solution.
     """
     surely = discount**_BACKUPS
@@ -293,7 +293,7 @@ def _fixed_point(
             return y, backup(y) - y
 
         x, gap = lax.cond(gains, lambda: (ahead, ahead_gap), swept)
-        # But for rounding, a step shrinks the residual: what no longer shrinks is rounding.
+        # Except for rounding, a step shrinks the residual: a residual that stops shrinking is rounding.
         return x, gap, size(gap) < (1 + surely) / 2 * left, count + 1
 
     def unfinished(carry: tuple) -> Bool[Array, ""]:
@@ -358,10 +358,10 @@ def _solve_values(
 
 
 def _one_by_one(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Let a linear solve that is mapped with ``vmap`` run in sequence on a CPU, together elsewhere.
+    """Run a linear solve that is mapped with ``vmap`` in sequence on a CPU, together elsewhere.
 
-    On two cores, batched LAPACK calls inside compiled loops have been seen to wait for each other for ever
-    (jaxlib 0.10, whatever the number of OpenBLAS's threads); in sequence, never. Nothing is lost by it there.
+    On two cores, batched LAPACK calls inside compiled loops can deadlock (seen with jaxlib 0.10, whatever the
+    number of OpenBLAS's threads); sequential calls never did, at the same speed.
     """
     alone = jax.custom_batching.custom_vmap(function)
 
@@ -409,13 +409,13 @@ def _by_column(function: Callable[[Float[Array, " S"]], Float[Array, " S"]], x: 
     return jax.vmap(function, in_axes=1, out_axes=1)(columns).reshape(x.shape) if x.ndim > 1 else function(x)
 
 
-# -- what a policy is worth, and where it goes --------------------------------------------------------
+# -- values and occupancies of a policy -----------------------------------------------------------------
 
 
 def policy_values(
     mdp: TabularMDP, policy: Float[Array, "S A"], reward: Float[Array, "S A"]
 ) -> Float[Array, " S"]:
-    """Exact discounted values ``V^pi(s)`` of a policy under a reward."""
+    """Return the exact discounted values ``V^pi(s)`` of a policy under a reward."""
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
     _require_numbers(mdp, "policy", policy)
@@ -430,7 +430,7 @@ def _policy_values(
 
 
 def features_to_go(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array, "S K"]:
-    """``mu(s)``: expected discounted features collected from each state on."""
+    """Return ``mu(s)``, the expected discounted features from each state on."""
     require_discounted(mdp)
     _require_numbers(mdp, "policy", policy)
     return _features_to_go(mdp, policy)
@@ -444,7 +444,7 @@ def _features_to_go(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array
 def occupancy(
     mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, "S A"]:
-    """Discounted occupancy ``x(s, a) = sum_t gamma^t P(s_t = s, a_t = a)``; sums to ``1 / (1 - gamma)``."""
+    """Return the occupancy ``x(s, a) = sum_t gamma^t P(s_t = s, a_t = a)``, of sum ``1 / (1 - gamma)``."""
     require_discounted(mdp)
     _require_numbers(mdp, "policy", policy)
     return _occupancy(mdp, policy, initial)
@@ -455,7 +455,7 @@ def _occupancy(
     mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None
 ) -> Float[Array, "S A"]:
     initial = mdp.initial if initial is None else jnp.asarray(initial, float)
-    # The transpose of the linear map above; differentiating it gives the transposed solve.
+    # The transpose of the linear map above; its derivative is the transposed solve.
     _, pull = jax.vjp(lambda rate: _solve_values(mdp, policy, rate), jnp.zeros(mdp.n_states))
     return pull(initial)[0][:, None] * policy
 
@@ -463,7 +463,7 @@ def _occupancy(
 def feature_expectations(
     mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, " K"]:
-    """Expected discounted features ``E_X[phi_k]`` of a policy."""
+    """Return the expected discounted features ``E_X[phi_k]`` of a policy."""
     require_discounted(mdp)
     _require_numbers(mdp, "policy", policy)
     return _feature_expectations(mdp, policy, initial)
@@ -477,10 +477,10 @@ def _feature_expectations(
 
 
 def feature_deviations(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array, " K"]:
-    """Standard deviation over trajectories of their discounted features ``sum_t gamma^t phi_k(s_t, a_t)``.
+    """Return standard deviations over trajectories of discounted features ``sum_t gamma^t phi_k(s_t, a_t)``.
 
-    Exact: the second moment of a discounted sum obeys a Bellman equation with discount ``gamma^2`` and rate
-    ``phi^2 + 2 gamma phi E[mu(s')]`` (Sobel 1982). Raises ``ValueError`` for discount 1.
+    The result is exact: the second moment of a discounted sum obeys a Bellman equation with discount
+    ``gamma^2`` and rate ``phi^2 + 2 gamma phi E[mu(s')]`` (Sobel 1982). Raises ``ValueError`` for discount 1.
     """
     require_discounted(mdp)
     _require_numbers(mdp, "policy", policy)
@@ -509,7 +509,7 @@ class FinitePlan(NamedTuple):
 
 
 def finite_soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int) -> FinitePlan:
-    """Soft plan over ``horizon`` steps by one backward sweep; any discount in (0, 1]."""
+    """Plan softly over ``horizon`` steps in one backward pass; any discount in (0, 1]."""
     _require_numbers(mdp, "reward", reward)
     return _finite_soft_plan(mdp, reward, horizon=horizon)
 
@@ -526,7 +526,7 @@ def _finite_soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], *, horizon: 
 
 
 def finite_hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int) -> FinitePlan:
-    """Optimal plan over ``horizon`` steps; ties are shared evenly; any discount in (0, 1]."""
+    """Plan optimally over ``horizon`` steps; ties are shared evenly; any discount in (0, 1]."""
     _require_numbers(mdp, "reward", reward)
     return _finite_hard_plan(mdp, reward, horizon=horizon)
 
@@ -545,7 +545,7 @@ def _finite_hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], *, horizon: 
 def finite_occupancy(
     mdp: TabularMDP, policies: Float[Array, "T S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, "T S A"]:
-    """Undiscounted visit probabilities ``P(s_t = s, a_t = a)`` of a time-dependent policy."""
+    """Return undiscounted visit probabilities ``P(s_t = s, a_t = a)`` of a time-dependent policy."""
     _require_numbers(mdp, "policy", policies)
     return _finite_occupancy(mdp, policies, initial)
 
@@ -565,7 +565,7 @@ def _finite_occupancy(
 
 
 def reachable_states(mdp: TabularMDP, initial: np.ndarray | None = None) -> np.ndarray:
-    """Boolean ``[S]``: the states that some sequence of actions reaches from the initial distribution."""
+    """Mark the states ``[S]`` that some sequence of actions reaches from the initial distribution."""
     successors = np.asarray(mdp.successors)
     possible = np.asarray(mdp.probabilities) > 0
     seen = np.asarray(mdp.initial if initial is None else initial) > 0

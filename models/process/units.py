@@ -1,9 +1,9 @@
-"""The scale of each feature: what makes programs, penalties, priors and tolerances independent of units.
+"""The scale of each feature, which makes programs, penalties, priors and tolerances independent of units.
 
 A feature's scale is its largest magnitude. Features divided by their scales lie in ``[-1, 1]``, and weights
-multiplied by them, *scaled weights*, are the reward in nats that each feature adds at most. Metres or
-millimetres change features and weights, and leave scaled features and scaled weights what they are. Learners
-and programs work on them, and return weights of the features as given.
+multiplied by them, *scaled weights*, are the reward in nats that each feature adds at most. A change of unit
+(metres to millimetres) changes features and weights, but not their scaled forms. Learners and programs work
+on scaled features and return weights of the original ones.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ def feature_scale(mdp: TabularMDP) -> Float[Array, " K"]:
     """
     if isinstance(mdp.features, jax.core.Tracer) or isinstance(mdp.available, jax.core.Tracer):
         return _largest(jnp, mdp.features, mdp.available)
-    # Computed here and now even inside a trace, so that scales of 1 are known to be 1.
+    # Computed outside any trace, so that scales of 1 are known to be 1.
     return _largest(np, np.asarray(mdp.features), np.asarray(mdp.available))
 
 
@@ -48,7 +48,7 @@ def _largest(xp: Any, features: Any, available: Any) -> Float[Array, " K"]:
 
 
 def with_scaled_features(mdp: TabularMDP) -> TabularMDP:
-    """Return the same process with each feature divided by its scale; itself where all scales are 1.
+    """Divide each feature by its scale; return the same process if all scales are 1.
 
     Examples
     --------
@@ -67,5 +67,5 @@ def with_scaled_features(mdp: TabularMDP) -> TabularMDP:
         return replace(mdp, features=mdp.features / scale)
     if (scale == 1).all():
         return mdp
-    # XLA multiplies by reciprocals, which leaves the largest magnitude a little off 1.
+    # XLA multiplies by reciprocals, which leaves the largest magnitude slightly off 1.
     return replace(mdp, features=jnp.asarray(np.asarray(mdp.features) / scale))

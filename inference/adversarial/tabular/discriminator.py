@@ -1,7 +1,7 @@
 """Discriminators and generators of tabular tasks, both exact: weights on all transitions, and soft plans.
 
-The objective is that of section 6.2.1: the expert's transitions are hidden behind reports, so ``log D`` is
-averaged over the posterior of the truth.
+The objective is that of section 6.2.1: the expert's transitions are hidden behind observations, so ``log D``
+is averaged over the posterior of the truth.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ class TabularDiscriminator(NamedTuple):
     Fields
     ------
     name : str
-    init : function of a key, giving the network
-    logits : function ``(network, log_policy [S, A], successors [S, A, U])`` giving log-odds of "expert"
+    init : function of a key, returning the network
+    logits : function ``(network, log_policy [S, A], successors [S, A, U])`` returning log-odds of "expert"
         ``[S, A, U]``
-    reward : function ``(network, log_policy)`` giving what the generator earns, ``[S, A]``
+    reward : function ``(network, log_policy)`` returning the generator's reward, ``[S, A]``
     """
 
     name: str
@@ -49,9 +49,9 @@ def tabular_airl(
     reward: Sequence[int] = (32,),
     potential: Sequence[int] = (32, 32),
 ) -> TabularDiscriminator:
-    """``D = exp f / (exp f + pi)``, ``f = g(s, a) + gamma h(s') - h(s)`` (Fu, Luo and Levine 2018).
+    """Build ``D = exp f / (exp f + pi)``, ``f = g(s, a) + gamma h(s') - h(s)`` (Fu, Luo and Levine 2018).
 
-    The generator earns ``g``: shaping changes no soft-optimal policy of an unending task.
+    The generator earns ``g``: shaping preserves the soft-optimal policies of an unending task.
     """
     discount, n_actions = float(mdp.discount), mdp.n_actions
     by_pair = jnp.broadcast_to(features[:, None], (*mdp.available.shape, features.shape[1]))
@@ -76,7 +76,7 @@ def tabular_airl(
 def tabular_gail(
     mdp: TabularMDP, features: Float[Array, "S d"], *, hidden: Sequence[int] = (64, 8)
 ) -> TabularDiscriminator:
-    """A free classifier of state and action; the generator earns ``-log(1 - D)`` (Ho and Ermon 2016)."""
+    """Build a free classifier of state and action whose reward is ``-log(1 - D)`` (Ho and Ermon 2016)."""
     shape = mdp.available.shape
     by_pair = jnp.broadcast_to(features[:, None], (*shape, features.shape[1]))
     actions = jnp.broadcast_to(jnp.eye(mdp.n_actions, dtype=DTYPE), (*shape, mdp.n_actions))
@@ -106,7 +106,7 @@ def _finite(mdp: TabularMDP, log_policy: Float[Array, "S A"]) -> Float[Array, "S
 def mean_of_log_probability(
     logits: Float[Array, "S A U"], expert: TransitionStatistic, completed: Completed
 ) -> Float[Array, ""]:
-    """``E[log D]`` over the hidden truth, nats a step: the expert's part as section 6.2.1 has it. Exact."""
+    """Average ``log D`` over the truth, exactly, in nats per step: the expert's part (section 6.2.1)."""
     del completed
     return jnp.sum(expert.weights * jax.nn.log_sigmoid(logits))
 
@@ -114,10 +114,10 @@ def mean_of_log_probability(
 def log_probability_of_mean(
     logits: Float[Array, "S A U"], expert: TransitionStatistic, completed: Completed
 ) -> Float[Array, ""]:
-    """``log D`` of each step's mean logit, as lines 13 and 16 of Algorithm 3 have it.
+    """Return ``log D`` of each step's mean logit, as in lines 13 and 16 of Algorithm 3.
 
-    ``log D`` is concave in the logit, so this is at least :func:`mean_of_log_probability` (Jensen). Of
-    earlier sessions no steps are kept: only the current one counts.
+    ``log D`` is concave in the logit, so this is at least :func:`mean_of_log_probability` (Jensen). Only the
+    current session's steps count.
     """
     del expert
     mean = jnp.einsum("nlsau,sau->nl", completed.steps, logits)
@@ -130,7 +130,7 @@ AVERAGES = {"log probabilities": mean_of_log_probability, "logits": log_probabil
 
 @shown_briefly
 class Losses(NamedTuple):
-    """Cross-entropy of the discriminator (nats), and the shares of either side that it tells right."""
+    """Cross-entropy of the discriminator (nats), and the shares of either side that it classifies right."""
 
     loss: Float[Array, ""]
     expert_accuracy: Float[Array, ""]
@@ -139,7 +139,7 @@ class Losses(NamedTuple):
 
 @shown_briefly
 class Sides(NamedTuple):
-    """What a discriminator tells apart: the expert's transitions, and the generator's ``[S, A, B]``."""
+    """Both sides of a discriminator: the expert's transitions, and the generator's ``[S, A, B]``."""
 
     expert: TransitionStatistic
     completed: Completed
@@ -154,7 +154,7 @@ def cross_entropy(
     sides: Sides,
     average: Callable[..., Float[Array, ""]] = mean_of_log_probability,
 ) -> tuple[Float[Array, ""], Losses]:
-    """Mean cross-entropy of both sides, nats a step. ``successors`` are those of the expert's weights.
+    """Return the mean cross-entropy of both sides, nats per step, on the expert's ``successors``.
 
     The generator's successors are the first entries of these lists.
     """
@@ -178,11 +178,11 @@ def proximal_plan(
     entropy: float,
     step: float,
 ) -> tuple[Float[Array, "S A"], Float[Array, " S"]]:
-    """Exact policy improvement: the best of ``E[step (r + entropy H(pi))] - KL(pi, old)``, and its values.
+    """Improve a policy exactly: maximise ``E[step (r + entropy H(pi))] - KL(pi, old)``; also return values.
 
-    It is itself a soft plan, of the reward ``(step r + log old) / (1 + step entropy)``: the trust region of
-    a policy gradient without gradients. An infinite step is the soft plan of ``r / entropy``. Its fixed
-    points under a reward that stays are those of the infinite step. ``values`` warm-start.
+    The result is a soft plan, of the reward ``(step r + log old) / (1 + step entropy)``: the trust region of
+    a policy gradient without gradients. An infinite step is the soft plan of ``r / entropy``. For a constant
+    reward the fixed points are those of the infinite step. ``values`` warm-start.
     """
     if np.isinf(step):
         plan = soft_plan(mdp, reward / entropy, values)

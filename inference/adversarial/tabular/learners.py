@@ -1,13 +1,13 @@
 """Adversarial learners of tabular tasks, with exact expert and exact generator (chapter 6.2).
 
 AIRL and GAIL in the session protocol. Both sides of the discriminator are weights on transitions: the
-expert's the posterior of the hidden truth given the reports, under the current policy; the generator's the
-occupancy of that policy. Nothing is sampled, so hidden steps, errors and both together need nothing of their
-own. The generator's step is a soft plan, not a policy gradient.
+expert's are the posterior of the hidden truth given the observations, under the current policy; the
+generator's are the occupancy of that policy. All expectations are exact, so hidden steps and noise, alone or
+together, need no special treatment. The generator's step is a soft plan, not a policy gradient.
 
-Networks, optimiser, policy and key are carried from session to session, as the dissertation has it
-(``theta^{i-1}`` and ``theta_gen^{i-1}``). What they alone remember is soon overwritten, so that a statistic
-of the expert's transitions is offered besides (``memory``), and kept by default.
+Sessions carry networks, optimiser, policy and key, as in the dissertation (``theta^{i-1}`` and
+``theta_gen^{i-1}``). Later sessions soon overwrite their content, so a statistic of the expert's transitions
+is carried as well by default (``memory``).
 """
 
 from __future__ import annotations
@@ -78,22 +78,22 @@ else:
 
 
 def airl_tabular(mdp: TabularMDP, **options: Any) -> Learner:
-    """Online AIRL that takes reports for the truth; what was not seen is left out.
+    """Build online AIRL that takes observations for the truth and leaves out hidden steps.
 
-    A session in which nothing was seen changes nothing. Options as for :func:`robust_airl_tabular`.
+    A session of hidden steps alone changes nothing. Options as for :func:`robust_airl_tabular`.
     """
     return _at_face_value("AIRL", mdp, tabular_airl, _AIRL, options)
 
 
 def robust_airl_tabular(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Learner:
-    """robust-AIRL: the posterior of the truth behind the reports, in exact expectation.
+    """Build robust-AIRL with the exact posterior of the truth behind the observations.
 
     Parameters
     ----------
     mdp : TabularMDP
         The expert's process without its reward; discount below 1.
-    sensor : Imperfection
-        What may be hidden, misread, or both.
+    sensor : Sensor
+        Visibility, noise, or both.
     **options
         Fields of :class:`TabularTraining`; ``features``, float ``[S, d]``, the networks' view of a state
         (one-hot by default); ``network``, a mapping of hidden layers: ``reward`` and ``potential`` of AIRL
@@ -102,13 +102,13 @@ def robust_airl_tabular(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> L
     Returns
     -------
     Learner
-        Its ``update`` raises :class:`DemonstrationError` naming trajectory and step for a report that cannot
-        be, and for trajectories above the horizon; the state it was given stays valid.
+        Its ``update`` raises :class:`DemonstrationError` naming trajectory and step for an impossible
+        observation, and for trajectories above the horizon; the given state stays valid.
 
     Raises
     ------
     ValueError
-        For discount 1, a sensor for another task, features of another shape, or an option that cannot be.
+        For discount 1, a sensor for another task, features of another shape, or an invalid option.
     """
     return _in_expectation("robust-AIRL", mdp, sensor, tabular_airl, _AIRL, options)
 
@@ -122,11 +122,11 @@ def gibbs_airl_tabular(
     change: float = 0.0,
     **options: Any,
 ) -> Learner:
-    """robust-AIRL as Algorithm 3 has it: ``draws`` sweeps of the single-site sampler in every round.
+    """Build robust-AIRL as in Algorithm 3: ``draws`` of the single-site sampler in every iteration.
 
-    Fewer, where the average logit of a step moves by at most ``change`` with one more (the mean over steps of
-    its absolute change); with 0 always so many. The dissertation's ``delta_G`` is the sum over a batch and as
-    many generated steps: its .1 with 1,024 steps is a ``change`` of 1e-4 here.
+    Sampling stops earlier if one more draw moves the average logit of a step by at most ``change`` (the mean
+    over steps of its absolute change); 0 never stops early. The dissertation's ``delta_G`` is the sum over a
+    batch and as many generated steps: its .1 with 1,024 steps is a ``change`` of 1e-4 here.
     """
     if draws < 1 or burn_in < 0:
         raise ValueError(f"a sampler needs at least one draw and no negative burn-in, got {draws}, {burn_in}")
@@ -159,10 +159,10 @@ def robust_airl_with_learned_sensor(
     trust: float = 2.0,
     **options: Any,
 ) -> Learner:
-    """robust-AIRL that learns how often each confusion happens, by expectation-maximisation.
+    """Build robust-AIRL that learns the probability of each confusion, by expectation-maximisation.
 
-    ``assumed`` says what may be confused; its probabilities are where learning starts, and count as
-    ``trust`` observations of each. ``view`` says what is hidden. Other options as for
+    ``assumed`` lists the possible confusions; its probabilities are the starting point, and count as
+    ``trust`` observations of each. ``view`` is the sensor's visibility. Other options as for
     :func:`robust_airl_tabular`.
     """
     if not trust > 0:
@@ -181,16 +181,16 @@ def robust_airl_with_learned_sensor(
 
 
 def gail_tabular(mdp: TabularMDP, **options: Any) -> Learner:
-    """Online GAIL that takes reports for the truth; what was not seen is left out (section 7.4.1).
+    """Build online GAIL that takes observations for the truth and leaves out hidden steps (section 7.4.1).
 
-    Its reward vanishes where the generator succeeds, so that planning afresh would undo what was learned:
+    Its reward vanishes where the generator succeeds, so that an infinite step would undo the learning:
     ``step`` must be finite. Options as for :func:`robust_airl_tabular`.
     """
     return _at_face_value("GAIL", mdp, tabular_gail, _GAIL, options)
 
 
 def robust_gail_tabular(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Learner:
-    """GAIL on the posterior of the truth behind the reports; options as for :func:`robust_airl_tabular`."""
+    """Build GAIL on the exact posterior of the truth; options as for :func:`robust_airl_tabular`."""
     return _in_expectation("robust-GAIL", mdp, sensor, tabular_gail, _GAIL, options)
 
 
@@ -199,7 +199,7 @@ _GAIL = TabularTraining(entropy=0.01, step=0.1)
 
 
 class _Look(NamedTuple):
-    """How a learner looks at reports: the truth behind them, as weights on ``successors [S, A, U]``.
+    """Completion of observations: the truth behind them, as weights on ``successors [S, A, U]``.
 
     ``truth(key, log_policy, evidence, seen, horizon, logits)``.
     """
@@ -288,12 +288,17 @@ def _learner(
         uniform = jnp.where(mdp.available, -jnp.log(jnp.sum(mdp.available, 1, keepdims=True)), -jnp.inf)
         none = None if look.learned is None else jnp.zeros(len(look.learned.chances))
         return TabularAdversarialState(
-            network, optimiser.init(network), uniform, jnp.zeros(mdp.n_states),
+            network,
+            optimiser.init(network),
+            uniform,
+            jnp.zeros(mdp.n_states),
             TransitionStatistic(
                 jnp.zeros(()), jnp.zeros(successors.shape), jnp.zeros((how.horizon, mdp.n_states))
             ),
-            () if none is None else ConfusionStatistic(none, none), jnp.zeros((), int), key,
-        )  # fmt: skip
+            () if none is None else ConfusionStatistic(none, none),
+            jnp.zeros((), int),
+            key,
+        )
 
     def session(
         state: TabularAdversarialState, demonstration: Demonstration
@@ -301,7 +306,7 @@ def _learner(
         given = None if look.sensor is None else evidence_of(mdp, look.sensor, demonstration)
 
         def complete(key: Array, network: Any, log_policy: Array, confusions: Any) -> tuple[Completed, Any]:
-            """The truth, and the sensor's statistic with it."""
+            """Return the truth, and the sensor's statistic with it."""
             logits = discriminator.logits(network, log_policy, successors)
             if look.learned is None:
                 return look.truth(key, log_policy, given, demonstration, how.horizon, logits), confusions
@@ -342,10 +347,10 @@ def _learner(
         kept = blend(state.statistic, summarised(completed), how.forgetting)
         own = jnp.sum(completed.log_likelihood)
         parts = (network, memory, log_policy, values, kept, confusions, state.session + 1, keys[0])
-        # A report that cannot be must not spoil what was learned (a fleet raises nothing).
+        # Keep the previous state if the observation has probability zero; compiled fleets cannot raise.
         possible = jnp.isfinite(own)
         new = jax.tree.map(partial(_chosen, possible), TabularAdversarialState(*parts), state)
-        # Where nothing of the expert is known there is nothing to tell the generator from.
+        # A session without known steps has no side to distinguish the generator from.
         unseen = state._replace(session=state.session + possible, key=keys[0])
         new = jax.tree.map(partial(_chosen, jnp.any(kept.weights > 0)), new, unseen)
         return new, _report(new, own, demonstration, met)
@@ -356,10 +361,14 @@ def _learner(
         if look.learned is not None:
             noise = fitted_confusions(look.learned, new.confusions, look.trust)
         fields: dict[str, Any] = {
-            "session": new.session, "log_likelihood": own / jnp.maximum(trajectories, 1),
-            "demonstration_log_likelihood": own, "iterations": how.iterations, "noise": noise,
-            "seconds": jnp.array(jnp.nan), "weights": new.weights,
-        }  # fmt: skip
+            "session": new.session,
+            "log_likelihood": own / jnp.maximum(trajectories, 1),
+            "demonstration_log_likelihood": own,
+            "iterations": how.iterations,
+            "noise": noise,
+            "seconds": jnp.array(jnp.nan),
+            "weights": new.weights,
+        }
         return TabularAdversarialInfo(**fields, **met._asdict())
 
     run = jax.jit(session)
@@ -395,7 +404,7 @@ def _chosen(possible: Array, new: Array, old: Array) -> Array:
 
 
 def _checked_features(mdp: TabularMDP, features: ArrayLike | None) -> Float[Array, "S d"]:
-    """Features of states with mean zero and deviation one, or one-hot."""
+    """Scale features of states to mean zero and deviation one, or encode them one-hot."""
     if features is None:
         return jnp.eye(mdp.n_states, dtype=DTYPE)
     x = np.asarray(features, float)

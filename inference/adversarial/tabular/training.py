@@ -1,4 +1,4 @@
-"""How adversarial learners of tabular tasks train, what they carry, and what they report."""
+"""Settings, state and info of the adversarial learners of tabular tasks."""
 
 from __future__ import annotations
 
@@ -17,29 +17,29 @@ OCCUPANCIES = {"visited": visited_transitions, "discounted": discounted_transiti
 
 
 class TabularTraining(NamedTuple):
-    """How a session trains.
+    """Settings of a session's training.
 
     Fields
     ------
     iterations : int
-        Rounds of discriminator and generator.
+        Iterations of discriminator and generator.
     updates : int
-        Of the discriminator in a round.
+        Steps of the discriminator in an iteration.
     learning_rate : float
-        Of its Adam.
+        Learning rate of its Adam.
     entropy : float
-        What the generator earns for a nat of entropy.
+        The generator's reward for a nat of entropy.
     step : float
-        Of the generator, see :func:`~i2rl.inference.adversarial.tabular.discriminator.proximal_plan`;
+        Step of the generator, see :func:`~i2rl.inference.adversarial.tabular.discriminator.proximal_plan`;
         infinite for a plan afresh.
     forgetting : float
         Exponent of the current session's share in the statistic of the expert's transitions: 1 counts all
-        sessions alike, less forgets slowly, 0 keeps nothing.
+        sessions alike, less forgets slowly, 0 uses the current session alone.
     occupancy : {"visited", "discounted"}
-        The generator's transitions: begun where the expert was and followed as long, or discounted from
+        The generator's transitions: from the expert's first states and over its lengths, or discounted from
         ``p0``.
     average : {"log probabilities", "logits"}
-        ``E[log D]``, or as the authors have it ``log D`` of the mean logit, which keeps no statistic.
+        ``E[log D]``, or as the authors do ``log D`` of the mean logit, which carries no statistic.
     horizon : int
         Longest trajectory of a demonstration.
     """
@@ -55,7 +55,7 @@ class TabularTraining(NamedTuple):
     horizon: int = 16
 
     def checked(self) -> TabularTraining:
-        """Itself. Raises ``ValueError`` naming a field that cannot be."""
+        """Validate the settings and return them. Raises ``ValueError`` naming an invalid field."""
         for name in ("iterations", "updates", "horizon"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
@@ -78,16 +78,16 @@ class TabularTraining(NamedTuple):
 
 @shown_briefly
 class TabularAdversarialState(NamedTuple):
-    """All that is carried from session to session.
+    """State that is carried from session to session.
 
     Fields
     ------
     network : the discriminator's
     optimiser : its optimiser's state
     log_policy : float ``[S, A]``, the generator
-    values : float ``[S]``, planning's warm start
-    statistic : TransitionStatistic, of the expert so far (what ``forgetting`` leaves of it)
-    confusions : ConfusionStatistic, or empty where the sensor is given
+    values : float ``[S]``, warm start of planning
+    statistic : TransitionStatistic, of the expert so far (after forgetting)
+    confusions : ConfusionStatistic, or empty if the sensor is given
     session : int
     key : random key
     """
@@ -109,22 +109,22 @@ class TabularAdversarialState(NamedTuple):
 
 @shown_briefly
 class TabularAdversarialInfo(NamedTuple):
-    """What a session did.
+    """Measures of a session.
 
     Fields
     ------
     session : int
     log_likelihood : float
-        Of the session's demonstration under the new policy, nats per trajectory, exact. At face value, of
-        the reported actions given the reported states.
+        Log-likelihood of the session's demonstration under the new policy, nats per trajectory, exact. At
+        face value, that of the observed actions given the observed states.
     demonstration_log_likelihood : float
-        The same in all.
+        The same, summed over trajectories.
     loss, expert_accuracy, generated_accuracy : float ``[iterations]``
-        Of the discriminator: cross-entropy in nats, and the shares of either side it told right.
+        Measures of the discriminator: cross-entropy in nats, and the shares of either side classified right.
     iterations : int
-        Rounds.
+        Iterations of the session.
     noise : float ``[M]``
-        Learned probabilities of the confusions; empty where the sensor is given.
+        Learned probabilities of the confusions; empty if the sensor is given.
     seconds : float
     weights : float ``[P]``
     """

@@ -1,4 +1,4 @@
-"""Programs as the dissertation prints them, kept to show why they fail.
+"""Programs as the dissertation prints them, to show why they fail.
 
 Imports :mod:`i2rl.inference.programs`.
 """

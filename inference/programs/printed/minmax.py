@@ -1,30 +1,30 @@
-"""The assignment gradient of MME-MTIRL as printed, kept to show that it cannot cluster.
+"""The assignment gradient of MME-MTIRL as printed, to show that it cannot assign trajectories.
 
 Section 5.1.2 ascends the Lagrangian (5.6) in the assignments ``v_{d,i}`` by::
 
     (sum_X P(X | d) + 1 + |X| / v_{d,i} (1 - log Z)) / sum_i v_{d,i},   P(X | d) = exp(pi_d theta_d.f_X) / Z
 
-in which nothing depends on what trajectory ``i`` did. Differentiating (5.6), with the laws at their optimum
-(D.5), gives instead, for a demonstrated trajectory::
+which does not depend on trajectory ``i``. The derivative of (5.6), with the laws at their optimum (D.5), is
+instead, for a demonstrated trajectory::
 
     (1 + log pi_d + eta S_d + theta_d.G_d - theta_d.f_i) / |X| + lambda_i
 
-where ``S_d = sum_X v Pr`` and ``G_d = sum_X v Pr f``; terms with ``Pr_d(X_i)`` cancel by (D.5). What was
-lost in appendix D on the way:
+where ``S_d = sum_X v Pr`` and ``G_d = sum_X v Pr f``; terms with ``Pr_d(X_i)`` cancel by (D.5). Appendix D
+makes three errors:
 
 - ``lambda_i``, one number per trajectory, is solved for from component ``d``'s own equation
   ``dL/dv_{d,i} = 0`` (D.15), as if each component had its own, and substituted (D.16). Its part
   ``theta_d.f_i / |X|`` then cancels ``-theta_d.f_i / |X|``, which (D.17) still has and (D.18), its
-  derivative, has not. (All of it substituted alike, that derivative would be zero.)
+  derivative, lacks. (Substituted throughout, it would make that derivative zero.)
 - ``d log Omega / dv`` is ``sum_X exp(u_X) (1 + u_X) / (|X| Omega)`` with ``u_X = pi_d theta_d.f_X``; (D.11)
-  keeps the 1 and drops ``u_X`` as of higher order. It is of the same order.
+  drops ``u_X`` as of higher order than 1. It is of the same order.
 - ``eta`` is one number, but (D.6) has one for each component.
 
-The corrected gradient does depend on the trajectory, with a sign of its own: of two trajectories, a component
-is offered more of the one that its reward explains *less*, for (5.6) is maximised over assignments as it is
-over laws, and an assignment whose laws have much entropy is a poor clustering. Hence the sound form
-(:mod:`~i2rl.inference.programs.minmax`): the likelihood, which is maximised over weights and assignments
-alike.
+The corrected gradient does depend on the trajectory, with an unexpected sign: of two trajectories, a
+component is offered more of the one that its reward explains *less*. The reason is that (5.6) is maximised
+over assignments as it is over laws, and assignments whose laws have much entropy separate trajectories badly.
+The sound form (:mod:`~i2rl.inference.programs.minmax`) therefore maximises the likelihood over both weights
+and assignments.
 """
 
 from __future__ import annotations
@@ -46,14 +46,14 @@ _LEAST_ASSIGNMENT = 1e-6
 
 @shown_briefly
 class TrajectorySpace(NamedTuple):
-    """Trajectories that could be, the demonstrated ones first.
+    """Possible trajectories, the demonstrated ones first.
 
     Fields
     ------
     features : float ``[M, K]``
         ``f_X = sum_t phi(s_t, a_t)`` of each.
     demonstrated : int
-        ``|X| = n``: how many, from the first on, were demonstrated.
+        ``|X| = n``: number of demonstrated trajectories, from the first on.
     """
 
     features: Float[np.ndarray, "M K"]
@@ -68,7 +68,7 @@ AssignmentGradient = Callable[
 def printed_assignment_gradient(
     space: TrajectorySpace, assignments: Float[np.ndarray, "n D"], weights: Float[np.ndarray, "D K"]
 ) -> Float[np.ndarray, "n D"]:
-    """The gradient of section 5.1.2 (and D.18): the same for all trajectories with the same assignment."""
+    """Return the gradient of section 5.1.2 (and D.18), the same for all trajectories with one assignment."""
     law_sums, log_omega = _law_sums(space, assignments, weights)
     n = len(assignments)
     return (law_sums + 1 + n / assignments * (1 - log_omega)) / assignments.sum(0)
@@ -77,7 +77,7 @@ def printed_assignment_gradient(
 def coded_assignment_gradient(
     space: TrajectorySpace, assignments: Float[np.ndarray, "n D"], weights: Float[np.ndarray, "D K"]
 ) -> Float[np.ndarray, "n D"]:
-    """The released code's step: the printed one with a minus before its third term, and an offset."""
+    """Return the released code's step: the printed one with a minus before its third term, and an offset."""
     law_sums, log_omega = _law_sums(space, assignments, weights)
     n, mass = len(assignments), assignments.sum(0) + _OFFSET
     return (law_sums + 1) / mass - n / ((assignments + _OFFSET) * mass) * (1 - log_omega)
@@ -86,14 +86,14 @@ def coded_assignment_gradient(
 def _law_sums(
     space: TrajectorySpace, assignments: np.ndarray, weights: np.ndarray
 ) -> tuple[Float[np.ndarray, " D"], float]:
-    """``sum_X P(X | d)`` over all trajectories of the space, and ``log Omega``."""
+    """Return ``sum_X P(X | d)`` over all trajectories of the space, and ``log Omega``."""
     proportions = assignments.mean(0)
     log_sums = logsumexp(space.features @ (proportions[:, None] * weights).T, axis=0)
     log_omega = float(logsumexp(log_sums, b=proportions))
     return np.exp(log_sums - log_omega), log_omega
 
 
-# -- what it is the gradient of -------------------------------------------------------------------------
+# -- the Lagrangian -------------------------------------------------------------------------------------
 
 
 def lagrangian(
@@ -104,7 +104,7 @@ def lagrangian(
     weights: Float[np.ndarray, "D K"],
     row_multipliers: Float[np.ndarray, " n"],
 ) -> float:
-    """Equation (5.6): assignments and laws ``Pr_d(X)`` are of the whole space, ``normaliser`` is ``eta``."""
+    """Evaluate (5.6); assignments and laws ``Pr_d(X)`` cover the whole space, ``normaliser`` is ``eta``."""
     n = space.demonstrated
     shown = assignments[:n]
     proportions, joint = shown.mean(0), assignments * laws
@@ -121,7 +121,7 @@ def lagrangian(
 def optimal_laws(
     space: TrajectorySpace, assignments: Float[np.ndarray, "M D"], weights: Float[np.ndarray, "D K"]
 ) -> tuple[Float[np.ndarray, "M D"], float]:
-    """The laws ``Pr_d`` that maximise (5.6), and the ``eta`` for which its first constraint holds.
+    """Return the laws ``Pr_d`` that maximise (5.6), and the ``eta`` for which its first constraint holds.
 
     ``v Pr = exp(-1 + pi_d (eta + theta_d.f))`` is (D.5); ``eta`` is one number for all components.
     """
@@ -145,7 +145,7 @@ def assignment_gradient(
     weights: Float[np.ndarray, "D K"],
     row_multipliers: Float[np.ndarray, " n"],
 ) -> Float[np.ndarray, "n D"]:
-    """The gradient of (5.6) in the demonstrated trajectories' assignments, the laws at their optimum."""
+    """Return the gradient of (5.6) in demonstrated trajectories' assignments, the laws at their optimum."""
     n = space.demonstrated
     laws, normaliser = optimal_laws(space, assignments, weights)
     joint, proportions = assignments * laws, assignments[:n].mean(0)
@@ -154,7 +154,7 @@ def assignment_gradient(
     return (common - space.features[:n] @ weights.T) / n + row_multipliers[:, None]
 
 
-# -- ascending it ---------------------------------------------------------------------------------------
+# -- ascent ---------------------------------------------------------------------------------------------
 
 
 def ascend_printed(
@@ -166,12 +166,11 @@ def ascend_printed(
     learning_rate: float = 0.01,
     ridge: float = 1e-2,
 ) -> tuple[Float[np.ndarray, "n D"], Float[np.ndarray, "D K"]]:
-    """Descend in the weights, to the end, and ascend in the assignments, a little, in turn.
+    """Alternate full descents in the weights with short ascents in the assignments.
 
     The weights of a component match its features, ``exp(pi_d theta_d.f)`` normalised over the space. The
-    assignments take ``steps`` steps of length ``learning_rate``, kept positive and normalised after each (the
-    released code does neither, and leaves them unbounded). Returns assignments ``[n, D]`` and weights ``[D,
-    K]``.
+    assignments take ``steps`` steps of length ``learning_rate``, clipped to be positive and normalised after
+    each (the released code leaves them unbounded). Returns assignments ``[n, D]`` and weights ``[D, K]``.
     """
     shown = space.features[: space.demonstrated]
     if len(assignments) != len(shown):
@@ -194,9 +193,9 @@ def ascend_printed(
 def matched_weights(
     space: TrajectorySpace, share: Float[np.ndarray, " n"], ridge: float = 1e-2
 ) -> Float[np.ndarray, " K"]:
-    """Weights ``theta_d`` whose law ``exp(pi_d theta_d.f)`` has the mean features of ``share``, ridge apart.
+    """Fit ``theta_d`` whose law ``exp(pi_d theta_d.f)`` has the mean features of ``share``, up to the ridge.
 
-    The zero of the first gradient of section 5.1.2 where the law is normalised, both sides divided by
+    This is the zero of the first gradient of section 5.1.2 for a normalised law, both sides divided by
     ``pi_d``; ``ridge`` is on ``pi_d theta_d``.
     """
     shown = space.features[: space.demonstrated]

@@ -1,7 +1,7 @@
-"""The observation program as chapter 6.1 prints it (Eqs. 6.5 to 6.7), in CasADi; kept for comparison.
+"""The observation program as chapter 6.1 prints it (Eqs. 6.5 to 6.7), in CasADi, for comparison.
 
-The unnormalised product of Eq. 6.5 is to equal the mean score of a report for every candidate truth. Where
-several candidates are given no reliabilities do that, and it is met in the least-squares sense, by a penalty
+The unnormalised product of Eq. 6.5 should equal the mean score of an observation for every candidate truth.
+With several candidates no reliabilities satisfy this, and it is met in the least-squares sense, by a penalty
 that grows tenfold four times. :class:`~i2rl.inference.programs.observation.ObservationProgram` replaces it.
 """
 
@@ -35,7 +35,7 @@ class PrintedSolution(NamedTuple):
     residual : float
         Root of the mean squared difference between products and scores.
     iterations : int
-        Of IPOPT, over all penalties.
+        IPOPT's iterations, over all penalties.
     """
 
     reliabilities: Float[np.ndarray, " J"]
@@ -50,35 +50,35 @@ def solve_printed_program(
     scores: ArrayLike,
     candidates: ArrayLike,
 ) -> PrintedSolution:
-    """Reliabilities of greatest entropy whose products are the reports' scores.
+    """Find reliabilities of greatest entropy whose products are the observations' scores.
 
     ::
 
         maximise  sum_j H(p_j) - v/2 sum_t sum_g candidates[t, g] (prod_j p_j(t, g) - c_t)^2
 
-    with ``v`` from 1 to 1e4, where ``p_j(t, g)`` is ``p_j`` if report ``t`` agrees with ``g`` on predicate
-    ``j``, else ``1 - p_j``.
-    Taking the mean score of each pair first (Eq. 6.6) would change nothing but the residual. Not convex: what
-    starts from one half ends in a local optimum.
+    with ``v`` from 1 to 1e4, where ``p_j(t, g)`` is ``p_j`` if observation ``t`` agrees with ``g`` on
+    predicate ``j``, else ``1 - p_j``. Averaging the scores of each pair first (Eq. 6.6) would change only the
+    residual. The program is not convex: from one half it ends in a local optimum.
 
     Parameters
     ----------
     predicates : bool ``[J, S, A]``
     states, actions : int ``[T]``
-        The pairs reported.
+        The observed pairs.
     scores : float ``[T]``
         In [0, 1].
     candidates : float ``[T, S, A]``
-        Weights of candidate truths, of sum one for each report. Uniform over the task's pairs is the program
-        as printed (``all``), a point at the report ``observed``, a point at the truth ``oracle``.
+        Weights of candidate truths, of sum one for each observation. Uniform over the task's pairs is the
+        program as printed (``all``), a point at the observation ``observed``, a point at the truth
+        ``oracle``.
 
     Raises
     ------
     ValueError
         For shapes that do not fit, indices out of range, scores outside [0, 1] or missing, and candidates
-        that are no distributions.
+        that are not distributions.
     ProgramNotSolved
-        When IPOPT gives up.
+        If IPOPT fails.
     """
     matches = reported_matches(predicates, states, actions, candidates)
     c = np.asarray(scores, float)
@@ -102,7 +102,7 @@ def solve_printed_program(
     np.add.at(wanted, said, (by_truth * c).T)
     used = weight > 0
     agree, weight, wanted = classes.agreements[used], weight[used], wanted[used] / weight[used]
-    # One penalty for one event, however its classes are called: what matters is what they agree on.
+    # One penalty for one event: classes with the same agreements are merged.
     events, event = np.unique(agree, axis=0, return_inverse=True)
     total = np.bincount(event.ravel(), weight)
     mean = np.bincount(event.ravel(), weight * wanted) / total

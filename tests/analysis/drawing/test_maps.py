@@ -150,7 +150,7 @@ def test_a_hidden_path_over_any_layout_shows_the_belief(kind: str) -> None:
     assert names <= set(layout.names)
     assert figure.get_size_inches()[1] < 9
     if kind == "maze":
-        assert "that never reach 1%" in figure.get_supxlabel()
+        assert "that never reach 1%" in figure.get_suptitle()
 
 
 def test_a_closed_loop_is_one_corridor() -> None:

@@ -325,7 +325,7 @@ def test_truths_that_do_not_fit_the_reports_are_named():
     lost[1, 2] = -1
     with pytest.raises(DemonstrationError, match="trajectory 1, step 2: what happened must be a pair"):
         learner.update(state, WithTruth(seen[0], replace(truth[0], state=lost)))
-    with pytest.raises(ValueError, match="forgetting is an exponent"):
+    with pytest.raises(ValueError, match="forgetting must be an exponent"):
         rifom(mdp, task().features, forgetting=2.0)
 
 
@@ -337,7 +337,7 @@ def test_truths_that_do_not_fit_the_reports_are_named():
         ({"scores": "some"}, "scores must be one of"),
         ({"truths": "guess"}, "truths must be one of"),
         ({"errors": -1.0}, "errors must be"),
-        ({"forgetting": 0.0}, "forgetting is an exponent"),
+        ({"forgetting": 0.0}, "forgetting must be an exponent"),
         ({"start": 1.0}, "between 0 and 1"),
         ({"iterations": 0}, "at least one iteration"),
         ({"truths": "all", "scores": "none"}, "made of scores"),

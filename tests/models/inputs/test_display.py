@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 
 import i2rl
+from i2rl.inference import Run, run_sessions
 from i2rl.inference.learners.lme import lme_i2rl
-from i2rl.inference.sessions.session import Run, run_sessions
 from i2rl.models import Demonstration, FeatureNoise, Sensor, TabularMDP, Visibility, soft_plan
 from i2rl.models.inputs.display import LONGEST, brief, shown_briefly
 from i2rl.models.observation.recordings import recording
