@@ -34,6 +34,13 @@ class Answer(NamedTuple):
     perception: pd.DataFrame | None = None
 
 
+class PerceptionSize(NamedTuple):
+    """The number ``|Psi|`` of predicates and the steps ``L`` of a trajectory under noisy perception."""
+
+    predicates: int | None = None
+    steps: int | None = None
+
+
 def answer(
     features: int | None,
     epsilon: float,
@@ -42,17 +49,17 @@ def answer(
     discount: float | None = None,
     deviation: float | None = None,
     mdp: str | None = None,
-    predicates: int | None = None,
-    steps: int | None = None,
+    perception: PerceptionSize = PerceptionSize(),  # noqa: B008 (immutable)
 ) -> Answer:
     """Ask the theorem and the tighter bounds.
 
     With ``mdp`` (``patrol1`` to ``patrol3``) the number of features, the discount and the spread of the
     features are those of an expert who softly obeys the patrol's true weights, and assumptions are checked
-    against it. ``predicates`` and ``steps`` (both or none) are the ``|Psi|`` and ``L`` of noisy perception.
+    against it. ``perception`` has both of its sizes, or neither where perception is not noisy.
     Raises ``ValueError`` for numbers out of range, for neither ``features`` nor ``mdp``, for both ``mdp`` and
     a value that it determines, and for ``predicates`` without ``steps`` or the reverse.
     """
+    predicates, steps = perception
     if (predicates is None) != (steps is None):
         raise ValueError("noisy perception is described by --predicates and --steps: give both or neither")
     found = _without_noise(features, epsilon, confidence, epsilon_s, discount, deviation, mdp)

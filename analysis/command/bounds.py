@@ -37,7 +37,14 @@ def print_bounds(
 
     with reported_errors():
         answer = bounds_answer.answer(
-            features, epsilon, confidence, epsilon_s, discount, deviation, mdp, predicates, steps
+            features,
+            epsilon,
+            confidence,
+            epsilon_s,
+            discount,
+            deviation,
+            mdp,
+            bounds_answer.PerceptionSize(predicates, steps),
         )
     if as_json:
         print(json.dumps(plain(bounds_answer.summary(answer))))

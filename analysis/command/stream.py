@@ -11,6 +11,7 @@ import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from io import FileIO
+from typing import NamedTuple, TypedDict, Unpack
 
 from jaxtyping import Array
 
@@ -199,6 +200,22 @@ def unread(lines: Iterable[Line], journal: Journal) -> Iterator[Line]:
 # -- sessions ---------------------------------------------------------------------------------------------
 
 
+class Reading(NamedTuple):
+    """The input's name, the limits of its lines, and the file for lines that are set aside."""
+
+    source: str = "input"
+    limits: LineLimits = DEFAULT_LIMITS
+    quarantine: Quarantine | None = None
+
+
+class ReadingOptions(TypedDict, total=False):
+    """:class:`Reading` as keyword arguments."""
+
+    source: str
+    limits: LineLimits
+    quarantine: Quarantine | None
+
+
 def learn_stream(
     learner: Learner,
     lines: Iterable[str | Line],
@@ -207,10 +224,8 @@ def learn_stream(
     *,
     size: int = 1,
     agent: int | None = None,
-    source: str = "input",
     on_session: Callable[[SessionInfo], None] | None = None,
-    limits: LineLimits = DEFAULT_LIMITS,
-    quarantine: Quarantine | None = None,
+    **reading: Unpack[ReadingOptions],
 ) -> int:
     """Run a session per ``size`` trajectories of JSON Lines, committing each before the next begins.
 
@@ -224,9 +239,10 @@ def learn_stream(
     Returns the number of new sessions. Raises ``DemonstrationError`` naming source, line and step, and
     ``JournalError``; every session before the error is in the journal.
     """
+    source, _, quarantine = options = Reading(**reading)
     state = learner.init(key) if journal.state is None else journal.state
     lines = unread(positioned(lines), journal)
-    records = _Records(lines, learner.mdp, source, limits, journal.position, quarantine)
+    records = _Records(lines, learner.mdp, options, journal.position)
     collected: list[tuple[Line, Record]] = []
     done = 0
 
@@ -268,13 +284,11 @@ class _Records:
         self,
         lines: Iterator[Line],
         mdp: TabularMDP,
-        source: str,
-        limits: LineLimits,
+        reading: Reading,
         here: Position,
-        quarantine: Quarantine | None,
     ) -> None:
-        self._lines, self._mdp, self._source, self._limits = lines, mdp, source, limits
-        self.here, self._quarantine = here, quarantine
+        self._lines, self._mdp, self.here = lines, mdp, here
+        self._source, self._limits, self._quarantine = reading
         self._line, self._broken = Line("", here), False
 
     def __iter__(self) -> Iterator[tuple[Line, Record]]:

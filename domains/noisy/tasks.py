@@ -22,7 +22,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -345,6 +345,22 @@ class NoisyDemonstration(NamedTuple):
     mdp: TabularMDP
 
 
+class Scoring(NamedTuple):
+    """Options for the scores of reports, see :func:`demonstrate_noisy`."""
+
+    scores: Scores | None = None
+    concentration: float = CONCENTRATION
+    reliabilities: np.ndarray | None = None
+
+
+class ScoringOptions(TypedDict, total=False):
+    """:class:`Scoring` as keyword arguments."""
+
+    scores: Scores | None
+    concentration: float
+    reliabilities: np.ndarray | None
+
+
 def demonstrate_noisy(
     key: Array,
     task: NoisyTask,
@@ -354,15 +370,14 @@ def demonstrate_noisy(
     trajectories: int = 2,
     steps: int = 3,
     starts: Starts = "all",
-    scores: Scores | None = None,
     visibility: Visibility | None = None,
-    concentration: float = CONCENTRATION,
-    reliabilities: np.ndarray | None = None,
+    **scoring: Unpack[ScoringOptions],
 ) -> NoisyDemonstration:
     """Simulate the task's optimal expert and observe it through ``noise`` (by default the task's own).
 
     Session ``i`` is ``trajectories`` rows of ``steps`` pairs (``seen.sessions(trajectories)``); section
-    7.4.3 has two of three. Every trajectory starts afresh. ``visibility`` hides steps as well. Scores are
+    7.4.3 has two of three. Every trajectory starts afresh. ``visibility`` hides steps as well. ``scores`` are
+    (with ``concentration``, 4 by default, and ``reliabilities``, none by default)
 
     - ``"calibrated"``, the perception's probability that it made no error. At every step each swap of the
       noise has a clarity ``u ~ Beta`` of mean one minus its noise and ``alpha + beta = concentration``, and
@@ -375,11 +390,12 @@ def demonstrate_noisy(
       - p_j`` for those it has wrong, with the given ``reliabilities [J]``; by default those of a
       :class:`FeatureNoise`, otherwise the agreement probabilities among the expert's pairs. It differs from
       the probability that the observation is right, and requires the truth.
-    - None: no scores.
+    - None (the default): no scores.
 
     Raises ``ValueError`` for other words, sizes below one, a concentration or reliabilities that are none,
     and noise or visibility for another number of states or actions.
     """
+    scores, concentration, reliabilities = Scoring(**scoring)
     if min(sessions, trajectories, steps) < 1:
         raise ValueError(
             f"sessions, trajectories and steps must be at least 1, got {sessions}, {trajectories} and {steps}"

@@ -257,27 +257,46 @@ def demonstrate(
 # -- the three instances ------------------------------------------------------------------------------
 
 
+class _Movement(NamedTuple):
+    """The states, the state that each action intends, and the probability that it succeeds."""
+
+    states: tuple[State, ...]
+    intend: Callable[[State, int], State]
+    success: float
+
+
+class _Reward(NamedTuple):
+    """The features of a transition, and the weights of the patrollers' reward."""
+
+    features: Callable[[State, int, State], tuple[bool, ...]]
+    names: tuple[str, ...]
+    weights: tuple[float, ...]
+
+
+class _Views(NamedTuple):
+    """The states in view at each percentage, and the percentage of the dissertation's experiments."""
+
+    rules: dict[int, Callable[[State], bool]]
+    observability: int = 30
+
+
 def _build(
     name: str,
-    states: tuple[State, ...],
-    intend: Callable[[State, int], State],
-    features: Callable[[State, int, State], tuple[bool, ...]],
-    feature_names: tuple[str, ...],
-    weights: tuple[float, ...],
+    movement: _Movement,
+    reward: _Reward,
+    views: _Views,
     *,
-    success: float,
     discount: float,
     patrollers: int,
-    views: dict[int, Callable[[State], bool]],
     breach: Breach | None,
     loop: int,
-    observability: int = 30,
 ) -> Patrol:
+    states, intend, success = movement
     index = {state: i for i, state in enumerate(states)}
     shape = (len(states), len(ACTIONS))
     successors = np.zeros((*shape, 2), int)
     probabilities = np.zeros((*shape, 2))
-    phi = np.zeros((*shape, len(feature_names)))
+    phi = np.zeros((*shape, len(reward.names)))
     for i, state in enumerate(states):
         for a in range(len(ACTIONS)):
             target = intend(state, a)
@@ -285,7 +304,7 @@ def _build(
             p = 1.0 if target == state else success
             successors[i, a] = index[target], i
             probabilities[i, a] = p, 1 - p
-            phi[i, a] = features(state, a, target)
+            phi[i, a] = reward.features(state, a, target)
     mdp = TabularMDP.from_successors(
         successors,
         probabilities,
@@ -293,10 +312,12 @@ def _build(
         discount=discount,
         states=[state.name for state in states],
         actions=ACTIONS,
-        feature_names=feature_names,
+        feature_names=reward.names,
     )
-    masks = {percent: np.array([rule(s) for s in states]) for percent, rule in views.items()}
-    return Patrol(name, mdp, np.array(weights), states, patrollers, masks, breach, loop, observability)
+    masks = {percent: np.array([rule(s) for s in states]) for percent, rule in views.rules.items()}
+    return Patrol(
+        name, mdp, np.array(reward.weights), states, patrollers, masks, breach, loop, views.observability
+    )
 
 
 def cell_ahead(state: State) -> Cell:
@@ -357,15 +378,13 @@ def four_hallways() -> Patrol:
 
     return _build(
         "patrol1",
-        states,
-        intend,
-        features,
-        tuple(f"switch to hallway {k}" for k in range(1, 5)),
-        (0.25, 0.25, 0.25, 0.25),
-        success=0.99,
+        _Movement(states, intend, success=0.99),
+        _Reward(features, tuple(f"switch to hallway {k}" for k in range(1, 5)), (0.25, 0.25, 0.25, 0.25)),
+        _Views(
+            {30: lambda s: s.column == 4 and s.row >= 3, 44: lambda s: s.column == 4, 100: lambda s: True}
+        ),
         discount=0.995,
         patrollers=1,
-        views={30: lambda s: s.column == 4 and s.row >= 3, 44: lambda s: s.column == 4, 100: lambda s: True},
         breach=None,
         loop=64,
     )
@@ -405,22 +424,22 @@ def boyd_fifth_floor() -> Patrol:
     }
     return _build(
         "patrol2",
-        _grid_states(cells),
-        _walk(cells),
-        features,
-        (
-            "moves",
-            "turns in hallway",
-            "turns at corner",
-            "turns in division 1",
-            "turns in division 2",
-            "turns in division 3",
+        _Movement(_grid_states(cells), _walk(cells), success=0.95),
+        _Reward(
+            features,
+            (
+                "moves",
+                "turns in hallway",
+                "turns at corner",
+                "turns in division 1",
+                "turns in division 2",
+                "turns in division 3",
+            ),
+            (4 / 7, 0, 0, 0, 3 / 7, 0),
         ),
-        (4 / 7, 0, 0, 0, 3 / 7, 0),
-        success=0.95,
+        _Views(views),
         discount=0.99,
         patrollers=2,
-        views=views,
         breach=Breach(tuple(sorted(cells | {(0, 0)})), State(0, 0, 0), ((9, 1),), 0.99),
         loop=56,
     )
@@ -476,27 +495,29 @@ def boyd_with_rooms() -> Patrol:
     ]
     return _build(
         "patrol3",
-        _grid_states(cells),
-        _walk(cells),
-        features,
-        ("moves", "in a room", "turns left in hallway", "enters a room", "leaves a room"),
-        (1.0, -1.0, 0.1, 0.0, 0.0),
-        success=0.99,
+        _Movement(_grid_states(cells), _walk(cells), success=0.99),
+        _Reward(
+            features,
+            ("moves", "in a room", "turns left in hallway", "enters a room", "leaves a room"),
+            (1.0, -1.0, 0.1, 0.0, 0.0),
+        ),
+        _Views(
+            {
+                9: view(*k1),
+                18: view(*k2),
+                33: view(*k4),
+                46: view(*k6),
+                65: view(*k10),
+                100: lambda s: True,
+            },
+            observability=18,
+        ),
         discount=0.99,
         patrollers=2,
-        views={
-            9: view(*k1),
-            18: view(*k2),
-            33: view(*k4),
-            46: view(*k6),
-            65: view(*k10),
-            100: lambda s: True,
-        },
         breach=Breach(
             tuple(sorted(cells | {(0, 17), (1, 0), (13, 13)})), State(0, 17, 2), ((1, 0), (13, 13)), 0.95
         ),
         loop=64,
-        observability=18,
     )
 
 

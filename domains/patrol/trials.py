@@ -82,6 +82,52 @@ class GoAtRandom(NamedTuple):
 GoRule = GoAtBestTime | GoWhenBest | GoAtRandom
 
 
+# -- settings -----------------------------------------------------------------------------------------
+
+
+@shown_briefly
+class Watching(NamedTuple):
+    """The learner's view and its times before departure.
+
+    Fields
+    ------
+    observability : int
+        Percent, as in ``patrol.views``.
+    observed_steps : int
+        Steps perceived before learning: sessions times five.
+    learning_seconds : float or float ``[trials]``
+        Time that learning takes; it is rounded up to steps of the patrol.
+    threshold_seconds : float, optional
+        The learner must leave within so many seconds from the start of the run. By default perception, mean
+        learning time and ``settings.rounds`` rounds of the patrol (section 7.4.1).
+    """
+
+    observability: int
+    observed_steps: int
+    learning_seconds: float | Float[np.ndarray, " trials"] = 0.0
+    threshold_seconds: float | None = None
+
+
+@shown_briefly
+class Planning(NamedTuple):
+    """The learner's beliefs about the patrollers, and its rule for departing.
+
+    Fields
+    ------
+    settings : BreachSettings, optional
+        The task that the learner plans for, if it differs from the true one (same horizon).
+    watcher : :func:`watch` or :func:`project`
+        Update of the belief about a patroller.
+    forecast : IndependentForecast or SimulatedForecast
+    go : GoAtBestTime, GoWhenBest or GoAtRandom
+    """
+
+    settings: BreachSettings | None = None
+    watcher: Watcher = watch
+    forecast: Forecast = IndependentForecast()
+    go: GoRule = GoWhenBest()
+
+
 # -- trials -------------------------------------------------------------------------------------------
 
 
@@ -128,17 +174,11 @@ def breach_trials(
     patrol: Patrol,
     log_policies: Float[Array, "P S A"],
     *,
-    observability: int,
-    observed_steps: int,
+    watching: Watching,
     trials: int,
-    learning_seconds: float | Float[np.ndarray, " trials"] = 0.0,
-    threshold_seconds: float | None = None,
     interaction: Interaction = Interaction(),  # noqa: B008 (immutable)
     settings: BreachSettings = BreachSettings(),  # noqa: B008 (immutable)
-    planned_with: BreachSettings | None = None,
-    watcher: Watcher = watch,
-    forecast: Forecast = IndependentForecast(),  # noqa: B008 (immutable)
-    go: GoRule = GoWhenBest(),  # noqa: B008 (immutable)
+    planning: Planning = Planning(),  # noqa: B008 (immutable)
 ) -> BreachOutcome:
     """Simulate trials: watch the patrol, learn, wait for a good moment, and try to reach the goal undetected.
 
@@ -154,26 +194,15 @@ def breach_trials(
         Instance 2 or 3.
     log_policies : float ``[P, S, A]``
         The patrollers' policies that the learner assumes, see :func:`greedy_policies`.
-    observability : int
-        Percent, as in ``patrol.views``.
-    observed_steps : int
-        Steps perceived before learning: sessions times five.
+    watching : Watching
+        The learner's view and its times before departure.
     trials : int
-    learning_seconds : float or float ``[trials]``
-        Duration of learning; it is rounded up to steps of the patrol.
-    threshold_seconds : float, optional
-        The learner must leave within so many seconds from the start of the trial. The default is perception,
-        mean learning time and ``settings.rounds`` rounds of the patrol (section 7.4.1).
     interaction : Interaction
         True meetings of the patrollers.
     settings : BreachSettings
         The true task.
-    planned_with : BreachSettings, optional
-        The task that the learner plans for, if it differs (same horizon).
-    watcher : :func:`watch` or :func:`project`
-        Update of the belief about a patroller.
-    forecast : IndependentForecast or SimulatedForecast
-    go : GoAtBestTime, GoWhenBest or GoAtRandom
+    planning : Planning
+        Task that the learner plans for, its beliefs about the patrollers, and its rule for departing.
 
     Raises
     ------
@@ -182,7 +211,8 @@ def breach_trials(
         times that are negative or not one per trial.
     """
     world = breach_task(patrol, settings.reach)
-    believed = settings if planned_with is None else planned_with._replace(horizon=settings.horizon)
+    observability, observed_steps, learning_seconds, threshold = watching
+    believed = settings if planning.settings is None else planning.settings._replace(horizon=settings.horizon)
     log_policies = jnp.asarray(log_policies, float)
     expected = (patrol.patrollers, patrol.mdp.n_states, patrol.mdp.n_actions)
     if log_policies.shape != expected:
@@ -193,7 +223,6 @@ def breach_trials(
             f"learning_seconds must be one number or one per trial ({trials}), none negative, "
             f"got shape {learning.shape}"
         )
-    threshold = threshold_seconds
     if threshold is None:
         rounds = settings.rounds * patrol.loop * SECONDS_PER_STEP
         threshold = observed_steps * SECONDS_PER_STEP + float(learning.mean()) + rounds
@@ -202,54 +231,78 @@ def breach_trials(
     # One compiled program serves learning times of about the same length.
     length = 64 * math.ceil((max(deadline, observed_steps) + 1) / 64) + settings.horizon
     true_policy = jnp.log(jnp.asarray(patrol.expert_policy()))
+    first, second = interaction.equilibrium
+    hashable = Interaction((first, second), interaction.length)
     ended, waited = _trials(
         jax.random.split(key, trials),
         jnp.asarray(ready),
-        patrol.mdp,
-        jnp.asarray(patrol.cell_of_state),
-        patrol.visibility(observability),
-        jnp.broadcast_to(true_policy, expected),
-        log_policies,
-        world,
-        breach_task(patrol, believed.reach),
-        settings,
-        believed,
-        jnp.array(observed_steps),
-        jnp.array(deadline),
-        settings.horizon,
-        length,
-        tuple(interaction.equilibrium),
-        interaction.length,
-        watcher,
-        forecast,
-        go,
+        _Patrollers(
+            patrol.mdp,
+            jnp.asarray(patrol.cell_of_state),
+            patrol.visibility(observability),
+            jnp.broadcast_to(true_policy, expected),
+            log_policies,
+        ),
+        _Tasks(
+            world,
+            breach_task(patrol, believed.reach),
+            settings,
+            believed,
+            jnp.array(observed_steps),
+            jnp.array(deadline),
+        ),
+        _Lengths(settings.horizon, length, hashable),
+        planning.watcher,
+        planning.forecast,
+        planning.go,
     )
     return BreachOutcome(np.asarray(ended), np.asarray(waited), float(threshold))
 
 
-@partial(jax.jit, static_argnums=tuple(range(13, 20)))
+class _Patrollers(NamedTuple):
+    """The patrollers as they are, and as the learner sees them and takes them to be."""
+
+    mdp: TabularMDP
+    cells: Int[Array, " S"]
+    view: Visibility
+    true_policies: Float[Array, "P S A"]
+    log_policies: Float[Array, "P S A"]
+
+
+class _Tasks(NamedTuple):
+    """The learner's true task, the one that it plans for, and its times."""
+
+    world: BreachTask
+    planned: BreachTask
+    settings: BreachSettings
+    believed: BreachSettings
+    observed: Int[Array, ""]
+    deadline: Int[Array, ""]
+
+
+class _Lengths(NamedTuple):
+    """Numbers of steps for which a program is compiled."""
+
+    horizon: int
+    length: int
+    interaction: Interaction
+
+
+# Rules are arguments of their own: as tuples without fields they would equal one another within a tuple.
+@partial(jax.jit, static_argnums=(4, 5, 6, 7))
 def _trials(
     keys: Array,
     ready: Int[Array, " n"],
-    mdp: TabularMDP,
-    cells: Int[Array, " S"],
-    view: Visibility,
-    true_policies: Float[Array, "P S A"],
-    log_policies: Float[Array, "P S A"],
-    world: BreachTask,
-    task: BreachTask,
-    settings: BreachSettings,
-    believed: BreachSettings,
-    observed: Int[Array, ""],
-    deadline: Int[Array, ""],
-    horizon: int,
-    length: int,
-    equilibrium: tuple[int, int],
-    meeting: int,
+    watched: _Patrollers,
+    tasks: _Tasks,
+    lengths: _Lengths,
     watcher: Watcher,
     forecast: Forecast,
     go: GoRule,
 ) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+    mdp, cells, view, true_policies, log_policies = watched
+    world, task, settings, believed, observed, deadline = tasks
+    horizon, length, interaction = lengths
     patrollers = jnp.arange(log_policies.shape[0])
     lost = jnp.array([LOST, UNKNOWN, UNKNOWN])
 
@@ -257,7 +310,7 @@ def _trials(
         first, patrol_key, look, go_key, predict_key, walk_key = jax.random.split(key, 6)
         start = jax.random.categorical(first, jnp.log(mdp.initial), shape=patrollers.shape)
         states, actions = simulate_patrollers(
-            patrol_key, mdp, cells, true_policies, start, equilibrium, meeting, length
+            patrol_key, mdp, cells, true_policies, start, *interaction, length
         )
         codes = jax.vmap(lambda p: observe(jax.random.fold_in(look, p), view, states[p], actions[p]))(
             patrollers

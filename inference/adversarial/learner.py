@@ -40,7 +40,7 @@ from .discriminator import (
     gradient_penalty,
 )
 from .rollouts import finished_returns
-from .truth import FaceValue, Truth, look
+from .truth import FaceValue, Settling, Truth, look
 from .updates import Objective, discriminator_updates
 
 if TYPE_CHECKING:
@@ -255,7 +255,14 @@ def adversarial(
             if expert is None or r % how.refresh == 0:
                 logits = partial(logits_of, network, policy)
                 chain, expert, made = look(
-                    truth, chain, sensor, policy, k_truth, task.actions, logits, how.change, how.draws
+                    truth,
+                    chain,
+                    sensor,
+                    policy,
+                    k_truth,
+                    task.actions,
+                    logits,
+                    Settling(how.change, how.draws),
                 )
                 draws.append(made)
             before = acting.running

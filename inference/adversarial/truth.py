@@ -82,6 +82,13 @@ class Sampled(NamedTuple):
     draws: int
 
 
+class Settling(NamedTuple):
+    """Sampling ends when the average logit moves by at most ``change``, or after ``draws`` samplings."""
+
+    change: float = np.inf
+    draws: int = 20
+
+
 def look(
     truth: Truth,
     chain: Any,
@@ -90,16 +97,16 @@ def look(
     key: Array,
     actions: ActionSpace,
     logits: Callable[[Transitions], Float[Array, "N M"]],
-    change: float = np.inf,
-    most: int = 20,
+    settling: Settling = Settling(),  # noqa: B008 (immutable)
 ) -> Sampled:
-    """Draw the truth until the average logit of its steps moves by at most ``change``, or ``most`` times.
+    """Draw the truth until the average logit of its steps settles.
 
     The move is the mean over steps of the absolute change of the average with one more draw. (Algorithm 3 as
     printed compares an average with itself; the released code sums over a batch and as many generated steps,
     so that the threshold depends on the batch.) The result has one shape, so that programs compile once;
     missing draws have weight zero. Actions are those of :func:`within_bounds`.
     """
+    change, most = settling
     chain, first = truth.refresh(chain, sensor, policy, key)
     first = within_bounds(actions, first)
     if np.isinf(change):

@@ -80,6 +80,13 @@ def exact_transitions(
     return Completed(log_likelihood, steps, _starts(steps, evidence.live, horizon))
 
 
+class Settling(NamedTuple):
+    """The discriminator's ``logits [S, A, B]``, and the ``change`` of their average that ends sampling."""
+
+    logits: Float[Array, "S A B"]
+    change: ArrayLike
+
+
 def gibbs_transitions(
     key: Array,
     mdp: TabularMDP,
@@ -88,13 +95,12 @@ def gibbs_transitions(
     horizon: int,
     draws: int,
     burn_in: int,
-    logits: Float[Array, "S A B"] | None = None,
-    change: ArrayLike = 0.0,
+    settling: Settling | None = None,
 ) -> Completed:
     """Estimate the same from ``draws`` of the single-site sampler (Eq. 6.10, lines 6-15).
 
-    After the last step the successor follows the dynamics. With the discriminator's ``logits``, drawing stops
-    when their average moves by at most ``change``
+    After the last step the successor follows the dynamics. With ``settling``, drawing stops when the average
+    logit moves by at most ``settling.change``
     (:func:`~i2rl.inference.completion.smoothing.settled_completions`).
     """
     n, length = evidence.live.shape
@@ -106,11 +112,11 @@ def gibbs_transitions(
         landed = landed / jnp.maximum(jnp.sum(landed, -1, keepdims=True), 1e-300)
         return s, a, jnp.where(follows[..., None], landed, mdp.probabilities[s, a])
 
-    if logits is None:
+    if settling is None:
         states, actions = gibbs_completions(key, mdp, log_policy, evidence, draws, burn_in)
         weights = jnp.full(draws, 1 / draws)
     else:
-        known: Array = logits
+        known, change = settling
 
         def score(states: Array, actions: Array) -> Array:
             s, a, landed = landed_at(states, actions)

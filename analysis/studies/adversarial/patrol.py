@@ -23,7 +23,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from ....domains.patrol.process import FORWARD, LEFT, RIGHT, Patrol, instance
-from ....domains.patrol.trials import breach_trials
+from ....domains.patrol.trials import Watching, breach_trials
 from ....inference.adversarial.tabular.learners import (
     airl_tabular,
     robust_airl_tabular,
@@ -168,8 +168,7 @@ def success_rates(
             jax.random.fold_in(jax.random.key(seed), i),
             patrol,
             both,
-            observability=100,
-            observed_steps=STEPS,
+            watching=Watching(100, STEPS),
             trials=trials,
         )
         rates.append(outcome.rate())

@@ -12,7 +12,13 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float, Int
 
-from ....domains.noisy.tasks import NoisyTask, Starts, agreement_probabilities, demonstrate_noisy
+from ....domains.noisy.tasks import (
+    NoisyDemonstration,
+    NoisyTask,
+    Starts,
+    agreement_probabilities,
+    demonstrate_noisy,
+)
 from ....domains.sorting.line import Line, Share, Tally, sort_belts
 from ....domains.sorting.process import pick_inspect_place
 from ....inference.completion.smoothing import evidence_of, smooth_all
@@ -68,9 +74,7 @@ class SensorPosterior(NamedTuple):
 def sensor_posterior(
     key: Array,
     task: NoisyTask,
-    mdp: TabularMDP,
-    seen: Demonstration,
-    truth: Demonstration,
+    shown: NoisyDemonstration,
     learned: Float[np.ndarray, " J"],
     pairs: Float[np.ndarray, "S A"],
     *,
@@ -82,17 +86,19 @@ def sensor_posterior(
     Reliabilities are parameters and are no frequencies, so only agreement can be compared with the truth,
     which is no :class:`FeatureNoise`.
     """
-    data = sample_noisy_posterior(key, mdp, task.features, seen, draws=draws, warmup=warmup, chains=2)
+    data = sample_noisy_posterior(
+        key, shown.mdp, task.features, shown.seen, draws=draws, warmup=warmup, chains=2
+    )
     reliabilities = np.asarray(data["posterior"]["reliabilities"]).reshape(-1, len(task.features))
     agreement = np.asarray(_agreement(jnp.asarray(task.features), jnp.asarray(pairs), reliabilities))
-    reports, pairs_done = (task.features[:, d.state, d.action] for d in (seen, truth))
+    reports, pairs_done = (task.features[:, d.state, d.action] for d in (shown.seen, shown.truth))
     return SensorPosterior(
         task.feature_names,
         agreement,
         np.asarray(learned),
         agreement_probabilities(task.noise, task.features, pairs),
         (reports == pairs_done).mean((1, 2)),
-        seen.n_trajectories,
+        shown.seen.n_trajectories,
         int(np.asarray(data["sample_stats"]["diverging"]).sum()),
         np.asarray(data["posterior"]["weights"]).reshape(len(reliabilities), -1),
     )

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -18,6 +18,7 @@ from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 
 from ....domains.noisy.tasks import (
+    NoisyDemonstration,
     NoisyTask,
     Starts,
     agreement_probabilities,
@@ -406,6 +407,20 @@ def _doubted(task: NoisyTask, streams: Streams, result: MethodResult, scores: st
 # -- the study ----------------------------------------------------------------------------------------
 
 
+class Examples(NamedTuple):
+    """Sizes of the examples: simulated ``belts`` of each method, ``draws`` of each chain of the posterior."""
+
+    belts: int = BELTS
+    draws: int = 100
+
+
+class ExampleOptions(TypedDict, total=False):
+    """:class:`Examples` as keyword arguments."""
+
+    belts: int
+    draws: int
+
+
 def noisy_study(
     name: str,
     *,
@@ -413,10 +428,9 @@ def noisy_study(
     sessions: int = 20,
     starts: Starts = "all",
     seed: int = 0,
-    belts: int = BELTS,
-    draws: int = 100,
     methods: Sequence[str] | None = None,
     advance: Advance = lambda description, fraction: None,
+    **examples: Unpack[ExampleOptions],
 ) -> NoisyStudy:
     """Learn the ``"sorting"`` or the ``"patrol"`` task through its noise with every method.
 
@@ -429,18 +443,19 @@ def noisy_study(
     starts : {"all", "natural"}
         Trajectories start in all states alike, or where the task naturally does.
     seed : int
+    methods : sequence of str, optional
+        Some of :data:`METHODS` besides :data:`PLAIN`, which is always there; all by default.
     belts : int
         Simulated belts for each method (sorting).
     draws : int
-        Of each of two chains of the joint posterior; none is sampled for zero.
-    methods : sequence of str, optional
-        Some of :data:`METHODS` besides :data:`PLAIN`, which is always there; all by default.
+        Of each of two chains of the joint posterior, 100 by default; none is sampled for zero.
 
     Raises
     ------
     ValueError
         For a task or method that does not exist, other starts, and numbers below one.
     """
+    belts, draws = Examples(**examples)
     if name not in TASKS:
         raise ValueError(f"tasks are {', '.join(TASKS)}; got {name!r}")
     for what, number in (("replications", replications), ("sessions", sessions), ("belts", belts)):
@@ -471,7 +486,7 @@ def noisy_study(
     advance("out of view", (len(chosen) + 1) / (len(chosen) + 3))
     hidden = _hidden(hide, judge, replications, sessions, starts) if name == "patrol" else None
     advance("examples", (len(chosen) + 2) / (len(chosen) + 3))
-    posterior, happened, sorted_ = _examples(show, judge, streams, results, starts, pairs, belts, draws)
+    posterior, happened, sorted_ = _examples(show, judge, streams, results, pairs, Examples(belts, draws))
     advance("done", 1.0)
     return NoisyStudy(
         task,
@@ -541,10 +556,8 @@ def _examples(
     judge: _Judge,
     streams: Streams,
     results: Mapping[str, MethodResult],
-    starts: Starts,
     pairs: Float[np.ndarray, "S A"],
-    belts: int,
-    draws: int,
+    examples: Examples,
 ) -> tuple[SensorPosterior | None, Strip, SortingTable | None]:
     """Return the posterior of the first stream's early sessions, and the completion of a new trajectory."""
     learned, early = results[PLAIN], min(EARLY, streams.seen.kind.shape[1])
@@ -553,11 +566,13 @@ def _examples(
     first = slice(0, early * TRAJECTORIES)
     seen, truth = (streams.whole(0, of).select(first) for of in ("seen", "truth"))
     posterior = None
+    belts, draws = examples
     if draws:
         estimate = learned.agreement[0, early - 1]
         posterior = sensor_posterior(
-            sample, judge.task, streams.mdp, seen, truth, estimate, pairs, draws=draws, warmup=draws
-        )
+            sample, judge.task, NoisyDemonstration(truth, seen, streams.mdp), estimate, pairs, draws=draws,
+            warmup=draws,
+        )  # fmt: skip
     reliabilities = jax.nn.sigmoid(learned.state.logits[0])
     happened = strip(walk, judge.task, learned.weights[0, -1], np.asarray(reliabilities))
     if judge.task.name == TASKS["patrol"]().name:

@@ -14,7 +14,14 @@ from jax import lax
 from jaxtyping import Float
 
 from ....domains.patrol.process import SECONDS_PER_STEP, Patrol, demonstrate, instance, simulate_patrol
-from ....domains.patrol.trials import REACHED, TIMED_OUT, BreachOutcome, breach_trials, greedy_policies
+from ....domains.patrol.trials import (
+    REACHED,
+    TIMED_OUT,
+    BreachOutcome,
+    Watching,
+    breach_trials,
+    greedy_policies,
+)
 from ....inference.completion.smoothing import evidence_of, smooth_all
 from ....inference.learners.lme import batch_lme, lme_i2rl, lme_i2rl_with_random_weights
 from ....inference.sessions.learner import Learner
@@ -316,10 +323,8 @@ def _evaluated(
                 jax.random.fold_in(key, 99),
                 patrol,
                 greedy_policies(patrol, weights[i, :, -1]),
-                observability=observability,
-                observed_steps=sessions * STEPS_PER_SESSION,
+                watching=Watching(observability, sessions * STEPS_PER_SESSION, float(learned[i].seconds[-1])),
                 trials=trials,
-                learning_seconds=float(learned[i].seconds[-1]),
             )
             for i, key in enumerate(keys)
         ]

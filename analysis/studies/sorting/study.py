@@ -10,7 +10,7 @@ from __future__ import annotations
 import time
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
 import numpy as np
@@ -154,18 +154,33 @@ class _Stream(NamedTuple):
     labels: Int[np.ndarray, " n"]
 
 
+class Design(NamedTuple):
+    """Independent ``replications`` from a ``seed``, ``steps`` of a trajectory, simulated ``belts`` of Table 7.2."""
+
+    replications: int = 3
+    seed: int = 0
+    steps: int = STEPS
+    belts: int = 300
+
+
+class DesignOptions(TypedDict, total=False):
+    """:class:`Design` as keyword arguments."""
+
+    replications: int
+    seed: int
+    steps: int
+    belts: int
+
+
 def sorting_study(
     tasks: int = 2,
     counts: Sequence[int] | None = None,
     *,
-    replications: int = 3,
-    seed: int = 0,
     methods: Sequence[str] | None = None,
     sessions: int | None = None,
     n_components: int = DEFAULT_COMPONENTS,
-    steps: int = STEPS,
-    belts: int = 300,
     advance: Advance = lambda description, fraction: None,
+    **design: Unpack[DesignOptions],
 ) -> SortingStudy:
     """Learn the sorters' behaviours with every method, from growing numbers of the same trajectories.
 
@@ -176,8 +191,6 @@ def sorting_study(
     counts : sequence of int, optional
         Numbers of trajectories, about as many of each behaviour. By default :data:`FEW` of them;
         :data:`GRID` has the dissertation's.
-    replications, seed : int
-        Independent repetitions. A smaller number of trajectories is the beginning of a larger one's.
     methods : sequence of str, optional
         Keys of :data:`METHODS`, all by default. EM-MLIRL is given the true number of components, as in the
         dissertation, or ``n_components`` of them like MME-MTIRL; both from as many starts as that.
@@ -186,17 +199,21 @@ def sorting_study(
         dissertation.
     n_components : int
         Components that MME-MTIRL starts with: the most it can find.
+    replications, seed : int
+        Independent repetitions, 3 by default. A smaller number of trajectories is the beginning of a larger
+        one's.
     steps : int
-        Of a trajectory.
+        Of a trajectory, 50 by default.
     belts : int
-        Simulated belts of Table 7.2.
+        Simulated belts of Table 7.2, 300 by default.
 
     Raises
     ------
     ValueError
         For numbers that make no study, saying which.
     """
-    _check(tasks, counts, replications, methods, sessions, n_components, steps, belts)
+    replications, seed, steps, belts = plan = Design(**design)
+    _check(tasks, counts, plan, methods, sessions, n_components)
     sizes = np.array(sorted(set(FEW[tasks] if counts is None else counts)))
     most = int(sizes[-1])
     ends = sizes if sessions is None else np.linspace(0, most, sessions + 1).round().astype(int)[1:]
@@ -265,12 +282,10 @@ def counts_of(tasks: int, text: str | None) -> tuple[int, ...] | None:
 def _check(
     tasks: int,
     counts: Sequence[int] | None,
-    replications: int,
+    design: Design,
     methods: Sequence[str] | None,
     sessions: int | None,
     n_components: int,
-    steps: int,
-    belts: int,
 ) -> None:
     if tasks not in GRID:
         raise ValueError(
@@ -278,9 +293,9 @@ def _check(
         )
     for name, number in (
         ("n_components", n_components),
-        ("replications", replications),
-        ("steps", steps),
-        ("belts", belts),
+        ("replications", design.replications),
+        ("steps", design.steps),
+        ("belts", design.belts),
     ):
         if number < 1:
             raise ValueError(f"{name} must be at least 1, got {number}")

@@ -40,6 +40,7 @@ from ....models.process.planning import require_discounted
 from ...completion.smoothing import evidence_of
 from ...completion.transitions import (
     Completed,
+    Settling,
     TransitionStatistic,
     exact_transitions,
     gibbs_transitions,
@@ -136,8 +137,8 @@ def gibbs_airl_tabular(
     def truth(
         key: Array, log_policy: Array, evidence: Any, seen: Demonstration, horizon: int, logits: Array
     ) -> Completed:
-        known = logits if change else None
-        return gibbs_transitions(key, mdp, log_policy, evidence, horizon, draws, burn_in, known, change)
+        settling = Settling(logits, change) if change else None
+        return gibbs_transitions(key, mdp, log_policy, evidence, horizon, draws, burn_in, settling)
 
     settings = {
         "truth": "gibbs",

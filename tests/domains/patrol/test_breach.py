@@ -43,6 +43,8 @@ from i2rl.domains.patrol.trials import (
     GoAtBestTime,
     GoAtRandom,
     GoWhenBest,
+    Planning,
+    Watching,
     breach_trials,
     greedy_policies,
     random_policies,
@@ -353,7 +355,8 @@ def standing_guard(*states):
 
 
 SURE = SETTINGS._replace(failure=0.0)
-COMMON = {"observability": 100, "observed_steps": 2, "trials": 64, "interaction": NO_MEETING}
+WATCHING = Watching(observability=100, observed_steps=2)
+COMMON = {"watching": WATCHING, "trials": 64, "interaction": NO_MEETING}
 
 
 def own_policies(patrol):
@@ -363,7 +366,9 @@ def own_policies(patrol):
 @pytest.mark.parametrize("go", [GoAtBestTime(), GoWhenBest()])
 def test_an_open_way_is_taken_at_once(go):
     patrol = standing_guard((16, 8, 2))
-    outcome = breach_trials(jax.random.key(0), patrol, own_policies(patrol), settings=SURE, go=go, **COMMON)
+    outcome = breach_trials(
+        jax.random.key(0), patrol, own_policies(patrol), settings=SURE, planning=Planning(go=go), **COMMON
+    )
     assert outcome.rate(REACHED) == 1
     assert (outcome.waited == 0).all()
 
@@ -381,7 +386,7 @@ def test_who_underrates_the_guards_sight_is_caught():
     blind = SURE._replace(reach=0.0, penalty=0.0)
     open_way = standing_guard((9, 1, 3))
     outcome = breach_trials(
-        jax.random.key(0), patrol, own_policies(patrol), settings=SURE, planned_with=blind, **COMMON
+        jax.random.key(0), patrol, own_policies(patrol), settings=SURE, planning=Planning(blind), **COMMON
     )
     # The guard's own cell lies on the only way, so even a learner who thinks it blind stays.
     assert outcome.rate(TIMED_OUT) == 1
@@ -390,7 +395,7 @@ def test_who_underrates_the_guards_sight_is_caught():
         standing_guard((10, 1, 1)),
         own_policies(open_way),
         settings=SURE,
-        planned_with=blind,
+        planning=Planning(blind),
         **COMMON,
     )
     assert outcome.rate(CAUGHT) == 1
@@ -411,9 +416,7 @@ def test_slow_learning_times_out():
         patrol,
         own_policies(patrol),
         settings=SURE,
-        learning_seconds=seconds,
-        threshold_seconds=200.0,
-        **COMMON,
+        **(COMMON | {"watching": WATCHING._replace(learning_seconds=seconds, threshold_seconds=200.0)}),
     )
     assert (outcome.ended == np.where(seconds > 200, TIMED_OUT, REACHED)).all()
 
@@ -425,7 +428,7 @@ def test_leaving_at_random_times_out_half_of_the_time():
         patrol,
         own_policies(patrol),
         settings=SURE,
-        go=GoAtRandom(),
+        planning=Planning(go=GoAtRandom()),
         **(COMMON | {"trials": n}),
     )
     assert abs(outcome.rate(TIMED_OUT) - 0.5) <= 4 * np.sqrt(0.25 / n)
@@ -472,9 +475,9 @@ def test_the_first_instance_has_nothing_to_breach():
     ("change", "message"),
     [
         ({"log_policies": TRUE[:1]}, "log_policies must have shape"),
-        ({"observability": 31}, "patrol2 has no 31 % view"),
-        ({"learning_seconds": -1.0}, "none negative"),
-        ({"learning_seconds": np.ones(3)}, "one per trial"),
+        ({"watching": WATCHING._replace(observability=31)}, "patrol2 has no 31 % view"),
+        ({"watching": WATCHING._replace(learning_seconds=-1.0)}, "none negative"),
+        ({"watching": WATCHING._replace(learning_seconds=np.ones(3))}, "one per trial"),
     ],
 )
 def test_errors_name_what_was_given(change, message):

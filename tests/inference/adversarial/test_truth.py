@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from i2rl.inference.adversarial.discriminator import ExpertTransitions, Transitions
-from i2rl.inference.adversarial.truth import FaceValue, look, reported_steps, within_bounds
+from i2rl.inference.adversarial.truth import FaceValue, Settling, look, reported_steps, within_bounds
 from i2rl.models.networks.modules import ActionSpace
 from i2rl.models.observation.recordings import recording
 
@@ -29,7 +29,7 @@ class Normal:
 
 
 def looked(change: float, most: int):
-    return look(Normal(), 0, (), None, KEY, ActionSpace(1), logits, change, most)
+    return look(Normal(), 0, (), None, KEY, ActionSpace(1), logits, Settling(change, most))
 
 
 def test_reported_steps_are_those_with_a_successor_or_a_termination():
@@ -83,7 +83,7 @@ def test_at_most_so_many_samplings_are_made():
 
 def test_reports_at_face_value_settle_at_once():
     rec = recording([np.arange(5.0)[:, None]], [np.zeros(5, int)])
-    found = look(FaceValue(), rec, (), None, KEY, ActionSpace(1), logits, 1e-9, 20)
+    found = look(FaceValue(), rec, (), None, KEY, ActionSpace(1), logits, Settling(1e-9, 20))
     assert found.draws == 2
 
 

@@ -10,6 +10,7 @@ import pytest
 from i2rl.inference.adversarial.tabular.discriminator import log_probability_of_mean, mean_of_log_probability
 from i2rl.inference.completion.smoothing import Evidence, evidence_of
 from i2rl.inference.completion.transitions import (
+    Settling,
     discounted_transitions,
     exact_transitions,
     gibbs_transitions,
@@ -129,9 +130,9 @@ def test_gibbs_until_the_average_logit_settles_is_gibbs_with_fewer_sweeps(random
     logits = jnp.asarray(np.random.default_rng(0).normal(size=mdp.successors.shape))
     key = jax.random.key(0)
     fixed = gibbs_transitions(key, mdp, log_policy, evidence, HORIZON, 30, 5)
-    never = gibbs_transitions(key, mdp, log_policy, evidence, HORIZON, 30, 5, logits, 0.0)
+    never = gibbs_transitions(key, mdp, log_policy, evidence, HORIZON, 30, 5, Settling(logits, 0.0))
     np.testing.assert_allclose(never.steps, fixed.steps, atol=1e-12)
-    early = gibbs_transitions(key, mdp, log_policy, evidence, HORIZON, 30, 5, logits, 0.05)
+    early = gibbs_transitions(key, mdp, log_policy, evidence, HORIZON, 30, 5, Settling(logits, 0.05))
     np.testing.assert_allclose(early.steps.sum((2, 3, 4)), evidence.live, atol=1e-9)
     assert np.abs(np.asarray(early.steps - fixed.steps)).max() > 0.01
 
