@@ -36,6 +36,8 @@ class Roles(griffe.Extension):
         for found in objects.values():
             if found.is_class and "__new__" in found.members and "__init__" not in found.members:
                 found.set_member("__init__", _initialiser(found.members["__new__"]))
+            if found.is_function and not found.is_alias:
+                _spell_out_options(found, index)
             if found.docstring is not None:
                 found.docstring.value = as_markdown(found.docstring.value, index, found)
 
@@ -125,6 +127,31 @@ def _add_public_names(pkg: griffe.Module, index: Index) -> None:
 def _initialiser(new: Any) -> griffe.Function:
     """Return the parameters of a named tuple's ``__new__`` as those of its class."""
     return griffe.Function("__init__", parameters=new.parameters, lineno=new.lineno)
+
+
+def _spell_out_options(function: griffe.Function, index: Index) -> None:
+    """Replace ``**options: Unpack[Options]`` by the keywords of ``Options``, with the defaults of its tuple.
+
+    The defaults are those of the named tuple beside it: ``Sampling`` for ``SamplingOptions``.
+    """
+    variadic = next((p for p in function.parameters if p.kind is griffe.ParameterKind.var_keyword), None)
+    unpacked = re.fullmatch(r"(?:typing\.)?Unpack\[(\w+)\]", str(variadic.annotation)) if variadic else None
+    found = index.by_name.get(unpacked[1], []) if unpacked else []
+    if variadic is None or not found:
+        return
+    options = index.objects[found[0]]
+    chosen = index.objects.get(found[0].removesuffix("Options"))
+    del function.parameters[variadic.name]
+    for name, attribute in options.attributes.items():
+        default = chosen.attributes[name].value if chosen and name in chosen.attributes else "..."
+        function.parameters.add(
+            griffe.Parameter(
+                name,
+                annotation=attribute.annotation,
+                kind=griffe.ParameterKind.keyword_only,
+                default=default,
+            )
+        )
 
 
 def _raises(match: re.Match[str]) -> str:

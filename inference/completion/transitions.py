@@ -80,6 +80,7 @@ def exact_transitions(
     return Completed(log_likelihood, steps, _starts(steps, evidence.live, horizon))
 
 
+@shown_briefly
 class Settling(NamedTuple):
     """The discriminator's ``logits [S, A, B]``, and the ``change`` of their average that ends sampling."""
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from ...models.inputs.display import shown_briefly
 from ...models.laws.chain import Smoothed
 from ...models.observation.evidence import (
     AnySensor,
@@ -31,6 +32,7 @@ from ..sessions.schedule import Schedule, program_slack, require_slack
 from ..sessions.statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
 
 
+@shown_briefly
 class Method(NamedTuple):
     """Choices that all parts of a session share."""
 

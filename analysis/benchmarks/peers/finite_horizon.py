@@ -275,7 +275,9 @@ def main() -> None:
     )
     parser.add_argument("--states", type=int, nargs="+", default=[124, 1024], help="numbers of states")
     parser.add_argument("--problems", type=int, default=3, help="random problems of each size")
-    parser.add_argument("--runs", type=int, default=5, help="our runs on each problem (the peer's: one)")
+    parser.add_argument(
+        "--replications", type=int, default=5, help="our replications on each problem (the peer's: one)"
+    )
     parser.add_argument("--tolerance", type=float, default=1e-2, help="gap in any state's visits to stop at")
     parser.add_argument("--peer-python", type=Path, default=Path(".venv-peers/bin/python"))
     parser.add_argument("--output", type=Path, default=Path("build/bench/peers.json"))
@@ -297,7 +299,7 @@ def main() -> None:
         script = Path(__file__).with_name("peer_mce.py")
         peer = Side("peer", [str(options.peer_python.absolute()), str(script)], folder, core)
         rows = [
-            compare(ours, peer, folder, n, options.problems, options.runs, options.tolerance)
+            compare(ours, peer, folder, n, options.problems, options.replications, options.tolerance)
             for n in options.states
         ]
         for side in (ours, peer):

@@ -155,7 +155,7 @@ class _Stream(NamedTuple):
 
 
 class Design(NamedTuple):
-    """Independent ``replications`` from a ``seed``, ``steps`` of a trajectory, simulated ``belts`` of Table 7.2."""
+    """Independent ``replications`` from a ``seed``, ``steps`` a trajectory, and ``belts`` of Table 7.2."""
 
     replications: int = 3
     seed: int = 0

@@ -70,7 +70,7 @@ def test_a_learner_a_run_and_what_it_brings_fit_into_two_lines(mdp, run):
     assert "state LMEState" not in repr(run)
     assert repr(run).endswith("LMEState)")
     assert repr(run.state).startswith("LMEState(")
-    for shown in (learner, run, run.state, run.reports[0], run.state.statistic):
+    for shown in (learner, run, run.state, run.infos[0], run.state.statistic):
         assert len(repr(shown)) <= LONGEST
         assert "Array(" not in repr(shown)
 
@@ -82,7 +82,7 @@ def test_sensors_and_plans_tell_types_and_shapes(mdp):
     assert repr(Visibility([1, 0, 0.5])) == "Visibility(in_view=[1, 0, 0.5])"
     noise = FeatureNoise(np.ones((2, S, A), bool), [0.9, 2 / 3])
     assert "reliabilities=[0.9, 0.667]" in repr(noise)
-    assert repr(Sensor(np.ones(S), noise)) == "Sensor(presence=float64[40], reading=ObservationModel)"
+    assert repr(Sensor(np.ones(S), noise)) == "Sensor(visibility=float64[40], noise=ObservationModel)"
 
 
 def test_whatever_jax_puts_into_the_fields_is_shown(mdp, demonstration, run):
@@ -163,7 +163,7 @@ class Reader(HTMLParser):
 
 
 def test_notebooks_get_a_small_table_without_colours_of_its_own(mdp, demonstration, run):
-    for shown in (mdp, demonstration, lme_i2rl(mdp, Sensor()), run, run.state, run.reports[0]):
+    for shown in (mdp, demonstration, lme_i2rl(mdp, Sensor()), run, run.state, run.infos[0]):
         page = Reader(shown._repr_html_())
         assert page.tags <= {"table", "caption", "tbody", "tr", "th", "td"}
         assert "color" not in page.styles
