@@ -8,7 +8,7 @@ TeX between dollars, ``Fields`` a table of attributes, ``See Also`` a list of re
 import re
 from collections import defaultdict
 from collections.abc import Iterator
-from typing import Any
+from typing import Any, cast
 
 import griffe
 
@@ -37,7 +37,7 @@ class Roles(griffe.Extension):
             if found.is_class and "__new__" in found.members and "__init__" not in found.members:
                 found.set_member("__init__", _initialiser(found.members["__new__"]))
             if found.is_function and not found.is_alias:
-                _spell_out_options(found, index)
+                _spell_out_options(cast(griffe.Function, found), index)
             if found.docstring is not None:
                 found.docstring.value = as_markdown(found.docstring.value, index, found)
 

@@ -276,7 +276,7 @@ def main() -> None:
     parser.add_argument("--states", type=int, nargs="+", default=[124, 1024], help="numbers of states")
     parser.add_argument("--problems", type=int, default=3, help="random problems of each size")
     parser.add_argument(
-        "--replications", type=int, default=5, help="our replications on each problem (the peer's: one)"
+        "--replications", type=int, default=5, help="our replications a problem (the peer: one)"
     )
     parser.add_argument("--tolerance", type=float, default=1e-2, help="gap in any state's visits to stop at")
     parser.add_argument("--peer-python", type=Path, default=Path(".venv-peers/bin/python"))
