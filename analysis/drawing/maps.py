@@ -98,7 +98,7 @@ _WEDGE = np.array([(0.03, 0.0), (0.48, 0.45), (0.48, -0.45)])
 
 
 def _placed(points: np.ndarray, place: tuple[float, float, int]) -> Float[np.ndarray, "n 2"]:
-    """Points of the patroller's frame at (row, column, heading), in axes whose rows grow downward."""
+    """Place points of the patroller's frame at (row, column, heading), in axes whose rows grow downward."""
     row, column, heading = place
     cos, sin = np.cos(heading * np.pi / 2), np.sin(heading * np.pi / 2)
     return np.asarray(points) @ np.array([[cos, -sin], [-sin, -cos]]) + (column, row)
@@ -312,7 +312,7 @@ def hidden_path(
 def _draw_strip(
     axes: Axes, theme: Theme, edges: Float[np.ndarray, " L"], seen: Bool[np.ndarray, " L"]
 ) -> None:
-    """Above the belief: when the patroller was in view."""
+    """Draw above the belief when the patroller was in view."""
     for t, here in enumerate(seen):
         color = theme.goal if here else theme.cell
         axes.axvspan(edges[t], edges[t + 1], facecolor=color, edgecolor="none")
@@ -333,7 +333,8 @@ def _draw_strip(
 
 
 def corridors(cells: Sequence[Cell]) -> tuple[tuple[Cell, ...], ...]:
-    """Cells of a floor in walking order: the longest corridor, then the longest of what is left, and so on.
+    """List cells of a floor in walking order: the longest corridor, then the longest of what is left, and so
+    on.
 
     A corridor is the longest of the shortest paths between two cells, by 4-neighbourhood.
     """
@@ -367,7 +368,7 @@ def _distances(cells: set[Cell], start: Cell) -> dict[Cell, int]:
 
 
 def _landmarks(strand: Sequence[Cell], place: dict[Cell, int]) -> list[int]:
-    """Positions worth a label: ends, corners, and a cell now and then between."""
+    """Find positions worth a label: ends, corners, and a cell now and then between."""
     corner = [
         i
         for i in range(1, len(strand) - 1)

@@ -108,7 +108,7 @@ class BreachOutcome(NamedTuple):
         return float(np.mean(self.ended == outcome))
 
     def interval(self, outcome: int = REACHED, level: float = 0.95) -> tuple[float, float]:
-        """Wilson's confidence interval of :meth:`rate`."""
+        """Compute Wilson's confidence interval of :meth:`rate`."""
         result = stats.binomtest(int(np.sum(self.ended == outcome)), len(self.ended))
         low, high = result.proportion_ci(level, "wilson")
         return float(low), float(high)
@@ -329,14 +329,16 @@ def _trials(
 
 
 def greedy_policies(patrol: Patrol, weights: Float[np.ndarray, "P K"]) -> Float[Array, "P S A"]:
-    """Log-policies optimal under each patroller's learned weights; ties as in the patrollers' own policy."""
+    """Compute log-policies optimal under each patroller's learned weights; ties as in the patrollers' own
+    policy.
+    """
 
     policies = [greedy_policy(patrol.mdp, w) for w in np.asarray(weights, float)]
     return jnp.log(jnp.asarray(np.stack(policies)))
 
 
 def soft_policies(patrol: Patrol, weights: Float[np.ndarray, "P K"]) -> Float[Array, "P S A"]:
-    """Soft log-policies under each patroller's learned weights."""
+    """Compute soft log-policies under each patroller's learned weights."""
     return _soft(patrol.mdp, jnp.asarray(weights, float))
 
 
