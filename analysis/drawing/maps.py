@@ -98,7 +98,7 @@ _WEDGE = np.array([(0.03, 0.0), (0.48, 0.45), (0.48, -0.45)])
 
 
 def _placed(points: np.ndarray, place: tuple[float, float, int]) -> Float[np.ndarray, "n 2"]:
-    """Place points of the patroller's frame at (row, column, heading), in axes whose rows grow downward."""
+    """Points of the patroller's frame at (row, column, heading), in axes whose rows grow downward."""
     row, column, heading = place
     cos, sin = np.cos(heading * np.pi / 2), np.sin(heading * np.pi / 2)
     return np.asarray(points) @ np.array([[cos, -sin], [-sin, -cos]]) + (column, row)
@@ -312,7 +312,7 @@ def hidden_path(
 def _draw_strip(
     axes: Axes, theme: Theme, edges: Float[np.ndarray, " L"], seen: Bool[np.ndarray, " L"]
 ) -> None:
-    """Draw above the belief when the patroller was in view."""
+    """Above the belief: when the patroller was in view."""
     for t, here in enumerate(seen):
         color = theme.goal if here else theme.cell
         axes.axvspan(edges[t], edges[t + 1], facecolor=color, edgecolor="none")
@@ -333,8 +333,7 @@ def _draw_strip(
 
 
 def corridors(cells: Sequence[Cell]) -> tuple[tuple[Cell, ...], ...]:
-    """List cells of a floor in walking order: the longest corridor, then the longest of what is left, and so
-    on.
+    """Cells of a floor in walking order: the longest corridor, then the longest of what is left, and so on.
 
     A corridor is the longest of the shortest paths between two cells, by 4-neighbourhood.
     """
@@ -368,7 +367,7 @@ def _distances(cells: set[Cell], start: Cell) -> dict[Cell, int]:
 
 
 def _landmarks(strand: Sequence[Cell], place: dict[Cell, int]) -> list[int]:
-    """Find positions worth a label: ends, corners, and a cell now and then between."""
+    """Positions worth a label: ends, corners, and a cell now and then between."""
     corner = [
         i
         for i in range(1, len(strand) - 1)

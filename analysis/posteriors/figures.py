@@ -323,7 +323,7 @@ def completed_path(
     theme: Theme = LIGHT,
     title: str = "Where the patroller may have been",
 ) -> Figure:
-    """Draw completions of a partly hidden path on the map's corridors: the posterior frequency of each cell.
+    """Completions of a partly hidden path on the map's corridors: how often each cell in the posterior.
 
     The uncertainty about the weights is in it, since each draw of the weights has its own completion.
     ``trajectories`` are the rows to show, one after the other (consecutive windows of one patrol, say);

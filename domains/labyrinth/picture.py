@@ -29,7 +29,7 @@ def maze_layout() -> np.ndarray:
 
 
 def _ahead(places: np.ndarray, node: int) -> np.ndarray:
-    """Compute the direction in which a node is entered from above."""
+    """Direction in which a node is entered from above."""
     way = places[node] - places[parent_of(node)]
     return way / np.abs(way).sum()
 

@@ -108,7 +108,7 @@ class BreachOutcome(NamedTuple):
         return float(np.mean(self.ended == outcome))
 
     def interval(self, outcome: int = REACHED, level: float = 0.95) -> tuple[float, float]:
-        """Compute Wilson's confidence interval of :meth:`rate`."""
+        """Wilson's confidence interval of :meth:`rate`."""
         result = stats.binomtest(int(np.sum(self.ended == outcome)), len(self.ended))
         low, high = result.proportion_ci(level, "wilson")
         return float(low), float(high)

@@ -108,7 +108,7 @@ class Streams(NamedTuple):
     mdp: TabularMDP
 
     def session(self, run: int, session: int, of: str = "seen") -> Demonstration:
-        """Return one session, counted from zero."""
+        """One session, counted from zero."""
         return Demonstration(*(np.asarray(x)[run, session] for x in getattr(self, of)))
 
     def whole(self, run: int, of: str = "seen") -> Demonstration:
