@@ -1,6 +1,6 @@
 """Several behaviours of a task: online against batch, a late component, hidden steps, experts who err.
 
-``python -m i2rl.analysis.benchmarks.statistics.n_components`` measures MME-MTIRL on onion sorting (26 states,
+``python -m i2rl.analysis.benchmarks.statistics.components`` measures MME-MTIRL on onion sorting (26 states,
 ``D = 4``):
 
 - *online*: trajectories arrive in sessions; value difference and cumulative seconds against re-running the
