@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 
 def patrol_environment(number: int = 2, weights: Sequence[float] | None = None, **options: Any) -> TabularEnv:
-    """One patroller of an instance; other options as :class:`TabularEnv`."""
+    """Make the environment of one patroller of an instance; other options as :class:`TabularEnv`."""
     patrol = instance(number)
 
     def scene() -> Scene:
@@ -78,7 +78,8 @@ def sorting_environment(
     weights: Sequence[float] | None = None,
     **options: Any,
 ) -> TabularEnv:
-    """Onion sorting; the reward is that of ``behaviour`` (by default the first), or ``weights``.
+    """Make the environment of onion sorting; the reward is that of ``behaviour`` (by default the first), or
+    ``weights``.
 
     Raises ``ValueError`` for a process or behaviour that does not exist, and if both ``behaviour`` and
     ``weights`` are given.

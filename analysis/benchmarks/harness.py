@@ -18,14 +18,14 @@ DEFAULT_FOLDER = Path("build/bench")
 
 
 def seconds(action: Callable[[], Any]) -> float:
-    """Wall-clock seconds of one call."""
+    """Measure wall-clock seconds of one call."""
     began = time.perf_counter()
     action()
     return time.perf_counter() - began
 
 
 def median_seconds(action: Callable[[], Any], replications: int = 5) -> float:
-    """Median over several calls, after one that compiles."""
+    """Measure the median over several calls, after one that compiles."""
     action()
     return float(np.median([seconds(action) for _ in range(replications)]))
 

@@ -39,7 +39,7 @@ class Interval(NamedTuple):
 
 
 def hoeffding(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
-    """Hoeffding's interval ``mean +- sqrt(log(2 / delta) / (2 n))``."""
+    """Compute Hoeffding's interval ``mean +- sqrt(log(2 / delta) / (2 n))``."""
     values = _in_unit_interval(values)
     half = np.sqrt(_log(delta) / (2 * values.shape[-2]))
     center = values.mean(axis=-2)
@@ -47,7 +47,7 @@ def hoeffding(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
 
 
 def empirical_bernstein(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
-    """Interval from the observed variance (Maurer and Pontil 2009, Theorem 4).
+    """Compute an interval from the observed variance (Maurer and Pontil 2009, Theorem 4).
 
     ``mean +- sqrt(2 V log(4 / delta) / n) + 7 log(4 / delta) / (3 (n - 1))`` with the sample variance ``V``.
     Raises ``ValueError`` for fewer than two values.
@@ -58,7 +58,7 @@ def empirical_bernstein(values: Float[np.ndarray, "... n K"], delta: float) -> I
 
 
 def predictable_bernstein(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
-    """Predictable plug-in interval (Waudby-Smith and Ramdas 2023, Theorem 2) for a fixed sample size.
+    """Compute predictable plug-in interval (Waudby-Smith and Ramdas 2023, Theorem 2) for a fixed sample size.
 
     Values are weighed by ``lambda_i``, chosen from the values before them to suit ``n``; the constant of
     its lower-order term is half that of :func:`empirical_bernstein`. Depends on the order of the values.
@@ -73,7 +73,7 @@ def predictable_bernstein(values: Float[np.ndarray, "... n K"], delta: float) ->
 
 
 def confidence_sequence(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
-    """Intervals after each value that hold at all times together (Waudby-Smith and Ramdas 2023, Theorem 2).
+    """Compute intervals after each value that hold at all times (Waudby-Smith and Ramdas 2023, Theorem 2).
 
     Arrays are ``[..., n, K]``: entry ``t`` uses the first ``t + 1`` values. With probability ``1 - delta``
     none of them misses, for every length of the sequence and every stopping rule, so that later intervals may
@@ -96,7 +96,9 @@ def _bernstein(variance: np.ndarray, n: int, delta: float) -> np.ndarray:
 def _bets(
     values: np.ndarray, horizon: Callable[[np.ndarray], np.ndarray], delta: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Bets ``lambda_t`` and squared errors ``(X_t - mu_{t-1})^2`` of the predictions made before ``X_t``."""
+    """Compute bets ``lambda_t`` and squared errors ``(X_t - mu_{t-1})^2`` of the predictions made before
+    ``X_t``.
+    """
     t = np.arange(1, values.shape[-2] + 1)[:, None]
     means = (0.5 + values.cumsum(axis=-2)) / (t + 1)
     variances = (0.25 + ((values - means) ** 2).cumsum(axis=-2)) / (t + 1)
@@ -110,7 +112,7 @@ def _delayed(x: np.ndarray, first: float) -> np.ndarray:
 
 
 def _cost(bets: np.ndarray) -> np.ndarray:
-    """``4 psi_E(lambda)``, to go with squared errors that are not multiplied by 4."""
+    """Compute ``4 psi_E(lambda)``, the factor of squared errors without the 4."""
     return -np.log1p(-bets) - bets
 
 
@@ -118,17 +120,19 @@ def _cost(bets: np.ndarray) -> np.ndarray:
 
 
 def hoeffding_size(error: float, delta: float) -> float:
-    """Size at which Hoeffding's half-width is ``error``: ``log(2 / delta) / (2 error^2)``, unrounded."""
+    """Compute the size at which Hoeffding's half-width is ``error``: ``log(2 / delta) / (2 error^2)``,
+    unrounded.
+    """
     return _log(delta) / (2 * positive("error", error) ** 2)
 
 
 def hoeffding_error(size: float, delta: float) -> float:
-    """Hoeffding's half-width after ``size`` values."""
+    """Compute Hoeffding's half-width after ``size`` values."""
     return float(np.sqrt(_log(delta) / (2 * positive("size", size))))
 
 
 def bernstein_size(deviation: float, error: float, delta: float) -> int:
-    """Smallest size at which :func:`empirical_bernstein` is as narrow as ``error``.
+    """Compute the smallest size at which :func:`empirical_bernstein` is as narrow as ``error``.
 
     ``deviation`` is the values' standard deviation, taken to be what will be observed: a plan, while the
     guarantee is the interval computed from the data themselves.
@@ -164,13 +168,15 @@ def _blocks(size: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def predictable_size(deviation: float, error: float, delta: float) -> int:
-    """Smallest size at which :func:`predictable_bernstein` is as narrow as ``error``; a plan likewise."""
+    """Compute the smallest size at which :func:`predictable_bernstein` is as narrow as ``error``; a plan
+    likewise.
+    """
     positive("error", error)
     return smallest(lambda n: predictable_half_width(deviation, n, delta) <= error)
 
 
 def smallest(enough: Callable[[int], object], least: int = 1) -> int:
-    """Smallest integer from ``least`` on that is enough, by doubling and bisection."""
+    """Find the smallest integer from ``least`` on that is enough, by doubling and bisection."""
     low, high = least - 1, max(least, 1)
     while not enough(high):
         low, high = high, 2 * high

@@ -111,7 +111,7 @@ def expert_of(mdp: TabularMDP, weights: Float[Array, " K"]) -> Expert:
 def simulate_features(
     key: Array, mdp: TabularMDP, expert: Expert, length: int, replications: int, size: int
 ) -> Float[Array, "replications size K"]:
-    """Discounted features of independent, fully seen trajectories."""
+    """Simulate discounted features of independent, fully seen trajectories."""
     powers = mdp.discount ** jnp.arange(length + 1)
 
     def one(key: Array) -> Float[Array, " K"]:
@@ -191,7 +191,8 @@ def expected_gaps(
     targets: Float[Array, "replications K"],
     slacks: Float[Array, "replications K"],
 ) -> Float[Array, " replications"]:
-    """``LL(theta_E) - LL(theta)`` of each program's solution, in expectation over the expert's trajectories.
+    """Compute ``LL(theta_E) - LL(theta)`` of each program's solution, in expectation over the expert's
+    trajectories.
 
     ``slacks`` are in units of the features as given.
     Nats per trajectory; never negative (Gibbs' inequality).
@@ -227,7 +228,7 @@ def ignorance_gap(mdp: TabularMDP, weights: Float[Array, " K"]) -> float:
 def full_view_coverage(
     key: Array, setting: Setting, replications: int, size: int, confidence: float
 ) -> list[Coverage]:
-    """Theorem 1 beside the bounds from observed variances, on the same fully seen trajectories.
+    """Check Theorem 1 beside the bounds from observed variances, on the same fully seen trajectories.
 
     ``epsilon`` is what ``size`` trajectories allow at ``confidence``.
     """
@@ -275,7 +276,7 @@ def _observed_rows(
 def occluded_coverage(
     key: Array, setting: Setting, replications: int, size: int, draws: int, delta: float
 ) -> list[Coverage]:
-    """Lemma 2 and Theorem 2 with completions under the expert's weights, exact and sampled.
+    """Check Lemma 2 and Theorem 2 with completions under the expert's weights, exact and sampled.
 
     ``delta`` is spent on each of ``epsilon`` (``size`` trajectories) and ``epsilon_s`` (``size * draws``
     sampled completions in all). The exact completion's rows are held to Theorem 1's bound: ``epsilon``
@@ -311,7 +312,7 @@ def occluded_coverage(
 def learned_coverage(
     key: Array, setting: Setting, replications: int, size: int, draws: int, delta: float, batch: int = 25
 ) -> list[Coverage]:
-    """Theorem 2 as LME-I2RL really runs: hidden steps completed under its own weights, exactly.
+    """Check Theorem 2 in LME-I2RL's own form: hidden steps completed under its own weights, exactly.
 
     The lemma's premise about completions is then not known to hold; the bound is the theorem's for ``draws``
     completions a trajectory. All trajectories come in one session.
@@ -355,7 +356,7 @@ def learned_gaps(
 def regret_coverage(
     key: Array, setting: Setting, replications: int, c: float, sessions: int, delta: float
 ) -> list[Coverage]:
-    """Theorem 3: average regret after every session up to the last, with sessions that grow as they must.
+    """Check Theorem 3: average regret after every session up to the last, with growing sessions.
 
     A run is covered if its expected regret is within the bound after each of its sessions; the bound and
     the quantile are those after the last.

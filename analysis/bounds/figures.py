@@ -31,7 +31,7 @@ def sample_size_plot(
     theme: Theme = LIGHT,
     title: str = "",
 ) -> Figure:
-    """Trajectories against the log-likelihood error they buy, for the theorem and the tighter bounds.
+    """Draw trajectories against the log-likelihood error they buy, for the theorem and the tighter bounds.
 
     ``deviations [K]`` of the features' discounted averages. ``ignorance`` (nats) marks the error that zero
     weights achieve without any data. With six features the rows of Table 7.1(a) are shown as points.

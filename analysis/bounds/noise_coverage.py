@@ -171,7 +171,7 @@ def learned_perception_coverage(
     delta: float,
     shift: float = 1.0,
 ) -> list[Coverage]:
-    """Theorem 6 with hidden pairs filled in under the learner's own weights, exactly.
+    """Check Theorem 6 with hidden pairs filled in under the learner's own weights, exactly.
 
     The learner believes in reliabilities that are all off by ``shift`` times ``epsilon_o``; -1 and 1 are
     corners of the theorem's range. It completes as LME-I2RL does: the premise about completions is not known

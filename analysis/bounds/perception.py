@@ -87,7 +87,7 @@ from .theorems import (
 def rimeo_constraint_bound(
     size: float, draws: float, epsilon: float, epsilon_s: float, perception: Perception, n_features: int
 ) -> Bound:
-    """Lemma 4 (chapter 6), Lemma 8 (appendix E), as printed: constraint bound under estimated perception.
+    """Bound by Lemma 4 (chapter 6), Lemma 8 (appendix E), as printed: constraints under estimated perception.
 
     ``(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon_r = epsilon + epsilon_s + L |Psi| epsilon_o`` with
     probability at least ``max(0, 1 - delta - delta_s - delta_o)``, ``delta_o = 2 K |Psi| exp(-2 n_o
@@ -193,7 +193,7 @@ def rimeo_confidence(
 
 
 def noisy_confidence(lemma: Bound, n_features: int, discount: float, norm: float | None = None) -> Bound:
-    """Theorem 6 from a corrected ``lemma``: of the expert's *expected* log-likelihood, as all of
+    """Bound by Theorem 6 from a corrected ``lemma``: of the expert's *expected* log-likelihood, as all of
     :mod:`~i2rl.analysis.bounds.theorems`.
 
     ``E[LL(theta_E) - LL(theta)] <= 2 epsilon_r |theta_E|_1 / (1 - gamma)`` with the lemma's probability, for

@@ -163,7 +163,7 @@ class Slope(NamedTuple):
 
 
 def log_log_slope(regret: Float[np.ndarray, " T"], burn_in: int = 10) -> Slope:
-    """Slope of an average regret on log-log axes, over every ``T >= burn_in``.
+    """Compute the slope of an average regret on log-log axes, over every ``T >= burn_in``.
 
     Every session counts once, so late sessions, dense on a logarithmic axis, decide. Raises ``ValueError``
     for fewer than two sessions after the burn-in, or for a regret that is not positive there.
@@ -186,7 +186,7 @@ def log_log_slope(regret: Float[np.ndarray, " T"], burn_in: int = 10) -> Slope:
 
 
 def sure_bound(beta: Float[np.ndarray, " T"], expert_weights: Float[np.ndarray, " K"]) -> np.ndarray:
-    """``1/T sum_{i <= T} beta_i |theta_E|_1 [T]``: the bound of the empirical average regret.
+    """Compute ``1/T sum_{i <= T} beta_i |theta_E|_1 [T]``: the bound of the empirical average regret.
 
     For programs solved to their optimum on a statistic that is the data's (module docstring).
     """

@@ -54,7 +54,7 @@ class Histories(NamedTuple):
 
 
 def likelihood_change(log_likelihood: Float[np.ndarray, "R T"], rho: float) -> Int[np.ndarray, " R"]:
-    """Criterion 1, :class:`~i2rl.inference.LikelihoodChange`: each stream's session of stopping, or 0."""
+    """Apply criterion 1, :class:`~i2rl.inference.LikelihoodChange`: each stream's stop, or 0."""
     return _first(np.abs(np.diff(log_likelihood, axis=1)) <= rho, 2)
 
 
@@ -64,14 +64,14 @@ def learning_error_change(error: Float[np.ndarray, "R T"], rho: float) -> Int[np
 
 
 def moving_window(values: Float[np.ndarray, "R T"], width: int, rho: float) -> Int[np.ndarray, " R"]:
-    """:class:`~i2rl.inference.MovingWindow`: as above, of log-likelihoods or gradients."""
+    """Apply :class:`~i2rl.inference.MovingWindow`: as above, of log-likelihoods or gradients."""
     if values.shape[1] < width:
         return np.full(len(values), NEVER)
     return _first(sliding_window_view(values, width, axis=1).std(-1) <= rho, width)
 
 
 def policy_window(greedy: Int[np.ndarray, "R T S"], width: int, rho: float) -> Int[np.ndarray, " R"]:
-    """:class:`~i2rl.inference.PolicyWindow`: as above, of greedy policies."""
+    """Apply :class:`~i2rl.inference.PolicyWindow`: as above, of greedy policies."""
     if greedy.shape[1] < width:
         return np.full(len(greedy), NEVER)
     now = greedy[:, width - 1 :]
@@ -81,7 +81,7 @@ def policy_window(greedy: Int[np.ndarray, "R T S"], width: int, rho: float) -> I
 
 
 def _first(fires: Bool[np.ndarray, "R n"], earliest: int) -> Int[np.ndarray, " R"]:
-    """Session of the first True of each row, the first column being session ``earliest``."""
+    """Find the session of the first True of each row; the first column is session ``earliest``."""
     return np.where(fires.any(1), fires.argmax(1) + earliest, NEVER)
 
 
@@ -119,7 +119,7 @@ class Verdict(NamedTuple):
         return 1 - float(self.used.mean()) / self.sessions
 
     def interval(self, confidence: float = 0.95) -> tuple[float, float]:
-        """Wilson interval of the false-stop rate."""
+        """Compute the Wilson interval of the false-stop rate."""
         interval = binomtest(self.false_stops, self.replications).proportion_ci(confidence, "wilson")
         return float(interval.low), float(interval.high)
 
@@ -198,7 +198,8 @@ def stopping_plot(
     title: str = "",
     note: str = "",
 ) -> Figure:
-    """False-stop rate against the sessions a rule lets pass, a line a rule, along its sweep of the tolerance.
+    """Draw the false-stop rate against the sessions before a stop, a line a rule, along its sweep of the
+    tolerance.
 
     The lower left is where a rule should go: few sessions, none of them too few. The axis of sessions is
     logarithmic, because the rules differ where nearly all sessions are saved. ``control`` is drawn behind

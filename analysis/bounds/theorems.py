@@ -57,7 +57,9 @@ from .concentration import (
 
 
 def failure_probability(size: float, error: float, events: float) -> float:
-    """``delta = 2 events exp(-2 n epsilon^2)``: Hoeffding's inequality and a union bound; may exceed 1."""
+    """Compute ``delta = 2 events exp(-2 n epsilon^2)`` by Hoeffding's inequality and a union bound; may
+    exceed 1.
+    """
     positive("error", error), counted("events", events)
     if not size >= 0:
         raise ValueError(f"size must not be negative, got {size}")
@@ -65,7 +67,7 @@ def failure_probability(size: float, error: float, events: float) -> float:
 
 
 def size_for(error: float, delta: float, events: float) -> float:
-    """Trajectories (or samples) for ``delta``: ``log(2 events / delta) / (2 epsilon^2)``, unrounded.
+    """Compute trajectories (or samples) for ``delta``: ``log(2 events / delta) / (2 epsilon^2)``, unrounded.
 
     The dissertation rounds to the nearest integer; the guarantee needs the next one.
     """
@@ -74,7 +76,9 @@ def size_for(error: float, delta: float, events: float) -> float:
 
 
 def error_for(size: float, delta: float, events: float) -> float:
-    """Error reached with ``size`` trajectories (or draws) for ``delta``; inverse of :func:`size_for`."""
+    """Compute the error reached with ``size`` trajectories (or draws) for ``delta``; inverse of
+    :func:`size_for`.
+    """
     counted("size", size), counted("events", events)
     return math.sqrt(math.log(2 * events / probability("delta", delta)) / (2 * size))
 
@@ -93,7 +97,8 @@ def sure_gap(epsilon: float, n_features: int, discount: float, norm: float | Non
 
 
 def me_i2rl_confidence(size: float, epsilon: float, n_features: int, discount: float) -> Bound:
-    """Theorem 1 (chapter 4), Theorem 3 (appendix B): confidence for ME-I2RL, under full observability.
+    """Bound by Theorem 1 (chapter 4), Theorem 3 (appendix B): confidence for ME-I2RL, under full
+    observability.
 
     ``LL(theta_E) - LL(theta^i) <= 2 K epsilon / (1 - gamma)`` with probability at least ``max(0, 1 -
     delta)``, ``delta = 2 K exp(-2 n epsilon^2)``. Inverses: :func:`size_for` and :func:`error_for` with ``K``
@@ -112,7 +117,7 @@ def me_i2rl_confidence(size: float, epsilon: float, n_features: int, discount: f
 
 
 def maximum_entropy_confidence(size: float, error: float, n_features: int, discount: float) -> Bound:
-    """Theorem 4 of appendix B (first of that number): the same bound by its log-likelihood error.
+    """Bound by Theorem 4 of appendix B (first of that number): the same bound by its log-likelihood error.
 
     ``LL(theta_E) - LL(theta) <= error`` nats with ``delta = 2 K exp(-n error^2 (1 - gamma)^2 / (2 K^2))``.
     """
@@ -125,7 +130,7 @@ def maximum_entropy_confidence(size: float, error: float, n_features: int, disco
 def lme_constraint_bound(
     size: float, draws: float, epsilon: float, epsilon_s: float, n_features: int
 ) -> Bound:
-    """Lemma 2 (chapter 4), Lemma 6 (appendix B): constraint bounds for LME-I2RL.
+    """Bound by Lemma 2 (chapter 4), Lemma 6 (appendix B): constraint bounds for LME-I2RL.
 
     ``(1 - gamma) |E[phi_k] - phi_hat_k| <= epsilon + epsilon_s`` for all ``k`` with probability at least
     ``max(0, 1 - delta - delta_s)``, ``delta_s = 2 K exp(-2 n_s epsilon_s^2)``. That completed features obey
@@ -149,7 +154,7 @@ def lme_constraint_bound(
 def lme_i2rl_confidence(
     size: float, draws: float, epsilon: float, epsilon_s: float, n_features: int, discount: float
 ) -> Bound:
-    """Theorem 2 (chapter 4), Theorem 4 (appendix B): confidence for LME-I2RL.
+    """Bound by Theorem 2 (chapter 4), Theorem 4 (appendix B): confidence for LME-I2RL.
 
     ``LL(theta_E) - LL(theta^i) <= 4 K epsilon_l / (1 - gamma)``, ``epsilon_l = (epsilon + epsilon_s) / 2``,
     with probability at least ``max(0, 1 - delta - delta_s)``. The program's slack is ``2 epsilon_l``.
@@ -181,7 +186,8 @@ class Regret(NamedTuple):
 def no_regret(
     c: float, session_sizes: Int[np.ndarray, " T"] | Sequence[int], n_features: int, discount: float
 ) -> Regret:
-    """Theorem 3 (chapter 4), Theorem 5 (appendix B): average regret with ``epsilon_i / (1 - gamma) = c / i``.
+    """Bound by Theorem 3 (chapter 4), Theorem 5 (appendix B): average regret with ``epsilon_i / (1 - gamma) =
+    c / i``.
 
     ``Regret_T <= 2 K c H_T / T`` with probability at least ``prod_i max(0, 1 - delta_i)``, ``delta_i = 2 K
     exp(-2 |X_{1:i}| epsilon_i^2)``. Three corrections: ``H_T = sum 1 / i`` exceeds the ``log T`` of the proof
@@ -214,7 +220,7 @@ def no_regret(
 
 
 def no_regret_sizes(c: float, sessions: int, delta: float, n_features: int, discount: float) -> np.ndarray:
-    """Session sizes with which Theorem 5's confidence is at least ``1 - delta`` for ever, integer ``[T]``.
+    """Compute session sizes with which Theorem 5's confidence stays at least ``1 - delta``, integer ``[T]``.
 
     The failure probability is spent as ``delta_i = 6 delta / (pi i)^2``, so that ``|X_{1:i}| >=
     i^2 log(2 K / delta_i) / (2 c^2 (1 - gamma)^2)``: sessions grow about linearly.
@@ -335,7 +341,7 @@ def observed_bound(
 
 
 def observed_size(deviations: Float[np.ndarray, " K"], error: float, confidence: float) -> int:
-    """Trajectories with which :func:`observed_bound` is about ``2 K error / (1 - gamma)`` nats.
+    """Compute trajectories with which :func:`observed_bound` is about ``2 K error / (1 - gamma)`` nats.
 
     ``deviations [K]`` are the standard deviations of the features' discounted averages ``(1 - gamma) f_k``
     (:func:`~i2rl.models.process.planning.feature_deviations` times ``1 - gamma``, or a guess). A plan: the
@@ -402,7 +408,8 @@ def demonstrations_needed(
 
 
 def table_7_1a(n_features: int = 6, delta: float = 0.1, discount: float = 0.99) -> pd.DataFrame:
-    """Table 7.1(a): trajectories for an error, with confidence ``1 - (delta + delta_s)``, both ``delta``.
+    """Tabulate Table 7.1(a): trajectories for an error, with confidence ``1 - (delta + delta_s)``, both
+    ``delta``.
 
     Indexed by ``epsilon_l``. ``trajectories`` is the nearest integer, as printed, ``sufficient`` the smallest
     number that keeps the promise. ``draws`` and ``error_nats`` are absent from the caption: the samples that
@@ -428,7 +435,7 @@ def table_7_1a(n_features: int = 6, delta: float = 0.1, discount: float = 0.99) 
 
 
 def table_7_1b(n_features: int = 6, epsilon: float = 0.1, delta_s: float = 0.1) -> pd.DataFrame:
-    """Table 7.1(b): confidence by number of trajectories, as printed and with ``delta_s`` counted.
+    """Tabulate Table 7.1(b): confidence by number of trajectories, as printed and with ``delta_s`` counted.
 
     The printed column is ``max(0, 1 - delta)``, Theorem 1's; the caption's ``1 - delta_l`` has ``delta_s``
     in it as well.

@@ -79,7 +79,7 @@ def _interrupt_again(unraisable: Any) -> None:
 
 
 def main() -> None:
-    """Entry point of the ``i2rl`` command."""
+    """Run the command ``i2rl``."""
     sys.unraisablehook = _interrupt_again
     if sys.stdout is None:  # closed by whoever started this
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115

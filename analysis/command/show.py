@@ -52,7 +52,7 @@ def show_journal(
 
 
 def _print_sessions(view: JournalView, last: int | None) -> None:
-    """One JSON object, a session a line, so that a long history is never held whole."""
+    """Print one JSON object, a session a line, so that memory does not grow with the history."""
     print(f'{{"origin": {json.dumps(plain(view.origin._asdict()))}, "sessions": [', end="")
     for i, r in enumerate(view.records(last)):
         fields = {

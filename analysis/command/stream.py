@@ -40,7 +40,7 @@ _TAIL = 256
 
 
 def followed(path: str, say: Callable[[str], None], poll_seconds: float = 0.2) -> Iterator[bytes]:
-    """Pieces of lines of a file that is still being written; never ends by itself.
+    """Yield pieces of lines of a file that is still being written, without end.
 
     A file that is replaced (rotated) is read to its end, and then the new one from its start. A file that is
     cut off or written anew is read from its start. Both are said; a line that was incomplete then ends.
@@ -164,7 +164,7 @@ def open_lines(
 
 
 def positioned(lines: Iterable[str | Line]) -> Iterator[Line]:
-    """Lines with their positions, which texts have from their number on."""
+    """Yield lines with their positions; texts have positions from their number on."""
     here = Position()
     for line in lines:
         line = line if isinstance(line, Line) else Line(line, here.after(line))

@@ -91,7 +91,7 @@ def learning_time(
     theme: Theme = LIGHT,
     title: str = "",
 ) -> Figure:
-    """Cumulative seconds of learning against trajectories seen, both on logarithmic scales.
+    """Draw cumulative seconds of learning against trajectories seen, both on logarithmic scales.
 
     Lines are medians, bands hold ``coverage`` of the replications. Raises ``ValueError`` for arrays that do
     not fit and for times that are not positive.
@@ -129,7 +129,7 @@ def success_rates(
     theme: Theme = LIGHT,
     title: str = "",
 ) -> Figure:
-    """Share of replications that reached the goal undetected, and that timed out, with Wilson intervals.
+    """Draw shares of replications that reached the goal undetected and that timed out, with Wilson intervals.
 
     Raises ``ValueError`` for a method without replications or with more outcomes than replications.
     """
@@ -193,7 +193,7 @@ def weights_plot(
     theme: Theme = LIGHT,
     title: str = "",
 ) -> Figure:
-    """Direction of the reward: learned weights or posterior draws beside the true ones, each of L1 norm 1.
+    """Draw reward's direction: learned weights or posterior draws beside the true ones, each of L1 norm 1.
 
     Points are medians, bars hold ``coverage`` of the draws. Different directions may prescribe one
     behaviour: a reward is identified no further than that. Raises ``ValueError`` if shapes do not fit or
@@ -290,7 +290,7 @@ def _direction(weights: Float[np.ndarray, "n K"]) -> Float[np.ndarray, "n K"]:
 
 
 def _of_runs(replications: set[int], coverage: float) -> str:
-    """Small print of a figure of medians and bands."""
+    """Write the small print of a figure of medians and bands."""
     if replications == {1}:
         return "line: one replication"
     return f"line: median; band: middle {coverage:.0%} of {_counts(replications, 'replication')}"

@@ -209,7 +209,7 @@ class _Prose:
         return re.sub(r"`([^`\n]+)`", r"<code>\1</code>", for_page(text))
 
     def meanings(self, text: str) -> str:
-        """Sentences on the acronyms in a table's cells that were not spelled out yet."""
+        """Write sentences on the acronyms in a table's cells that were not spelled out yet."""
         new = [name for name in dict.fromkeys(_ACRONYM.findall(text)) if name not in self._told]
         self._told |= set(new)
         return " ".join(f"{name}: {GLOSSARY[name]}." for name in new)

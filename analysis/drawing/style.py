@@ -59,7 +59,7 @@ class Theme(NamedTuple):
         return LinearSegmentedColormap.from_list(f"{self.name} heat", self.heat)
 
     def signed_shades(self, values: Float[ndarray, "..."]) -> ScalarMappable:
-        """Colours of values of either sign: zero is the colour in the middle, both sides have one scale."""
+        """Colour values of either sign: zero is the colour in the middle, both sides have one scale."""
         largest = max((abs(float(v)) for v in values.ravel() if v == v), default=0.0)
         colours = LinearSegmentedColormap.from_list(f"{self.name} signed", self.signed)
         return ScalarMappable(CenteredNorm(0.0, largest or 1.0), colours)
@@ -283,14 +283,14 @@ def name_ticks(
 
 
 def headline(figure: Figure, theme: Theme, title: str, size: float = TITLE + 0.5) -> None:
-    """Title above all axes of a figure that has no legend there."""
+    """Set the title above all axes of a figure without a legend there."""
     figure.suptitle(for_figure(title), color=theme.ink, fontsize=size, x=0.01, ha="left")
 
 
 def head(
     figure: Figure, theme: Theme, handles: Sequence[Artist], *, title: str = "", columns: int = 3
 ) -> None:
-    """Title and legend above all axes; one block, so that neither can cover the other."""
+    """Set the title and legend above all axes; one block, so that neither can cover the other."""
     named: dict[str, Any] = (
         {"labels": [for_figure(handle.get_label()) for handle in handles]} if handles else {}
     )
@@ -311,7 +311,7 @@ def head(
 
 
 def foot(figure: Figure, theme: Theme, note: str) -> None:
-    """Small print below all axes."""
+    """Set the small print below all axes."""
     figure.supxlabel(for_figure(note), color=theme.muted, fontsize=TEXT - 1, x=0.99, ha="right")
 
 

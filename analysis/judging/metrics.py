@@ -57,8 +57,7 @@ class Evaluation(NamedTuple):
 
 
 def greedy_policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """Compute the deterministic policy that is optimal for ``weights``; ties go to the first action of the
-    MDP.
+    """Compute deterministic policy that is optimal for ``weights``; ties go to the first action of the MDP.
 
     Actions within 1e-9 of the best, relative to the spread of the values, count as tied. Raises
     ``ValueError`` for discount 1, weights of the wrong number, or weights that are not numbers.
@@ -72,7 +71,7 @@ def optimal_actions(mdp: TabularMDP, weights: Float[Array, " K"]) -> Bool[Array,
 
 
 def policy_accuracy(mdp: TabularMDP, optimal: Bool[Array, "S A"], policy: Float[Array, "S A"]) -> Accuracy:
-    """Probability that ``policy`` takes one of the ``optimal`` actions, averaged over states.
+    """Compute the probability that ``policy`` takes one of the ``optimal`` actions, averaged over states.
 
     For a deterministic policy this is LBA; pass a policy here to break its ties differently. Every optimal
     action counts as a match.
@@ -87,7 +86,7 @@ def policy_accuracy(mdp: TabularMDP, optimal: Bool[Array, "S A"], policy: Float[
 def policy_error(
     mdp: TabularMDP, true_weights: Float[Array, " K"], policy: Float[Array, "S A"]
 ) -> LearningError:
-    """Inverse learning error of any policy, under the reward of ``true_weights``."""
+    """Compute the inverse learning error of any policy, under the reward of ``true_weights``."""
     return _policy_error(mdp, _checked(mdp, true_weights), jnp.asarray(policy))
 
 
@@ -118,7 +117,9 @@ def chance_accuracy(
 def behaviour_accuracies(
     mdp: TabularMDP, optimal: Bool[Array, "S A"], weights: Float[Array, "N K"]
 ) -> Float[Array, " N"]:
-    """LBA of many weights, of features that need not be the true reward's; ``optimal`` is the expert's."""
+    """Compute LBA of many weights, of features that need not be the true reward's; ``optimal`` is the
+    expert's.
+    """
 
     def accuracy(learned: Float[Array, " K"]) -> Float[Array, ""]:
         policy = deterministic_policy(hard_plan(mdp, reward_of(mdp, learned)).optimal)
@@ -131,7 +132,7 @@ def behaviour_accuracies(
 def inverse_learning_error(
     mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
 ) -> LearningError:
-    """ILE of :func:`greedy_policy` of the learned weights, in units of discounted true reward.
+    """Compute ILE of :func:`greedy_policy` of the learned weights, in units of discounted true reward.
 
     ``||V^{pi*} - V^{pi}||_1`` sums over states; both values are exact and under the true reward (chapter 3,
     section 7.2). Errors as for :func:`greedy_policy`.
@@ -160,7 +161,7 @@ def evaluate(
 def demonstration_log_likelihoods(
     mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, " K"], demonstration: Demonstration
 ) -> Float[Array, " n"]:
-    """Exact log-likelihood (nats) of each trajectory under the soft policy of ``weights``.
+    """Compute the exact log-likelihood (nats) of each trajectory under the soft policy of ``weights``.
 
     Hidden steps are summed out (section 1 of the methods); ``-inf`` for a trajectory the model rules out.
     Errors as for :func:`greedy_policy`, and ``ValueError`` for a sensor made for another MDP.
@@ -244,7 +245,7 @@ class Band(NamedTuple):
 
 
 def quantile_band(replications: Float[np.ndarray, "replications ..."], coverage: float = 0.5) -> Band:
-    """Median and central quantiles over the first axis; ``coverage`` 0.5 gives the quartiles.
+    """Compute the median and central quantiles over the first axis; ``coverage`` 0.5 gives the quartiles.
 
     The band says where the middle ``coverage`` of the replications lie; it is not a confidence interval of
     the median. A NaN among the replications makes its column NaN rather than vanish. Raises ``ValueError``

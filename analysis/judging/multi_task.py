@@ -34,7 +34,8 @@ def expected_value_difference(
     assignments: Int[np.ndarray, " n"],
     demonstration: Demonstration,
 ) -> float:
-    """EVD: value lost by acting as was learned, summed over the states of a trajectory, mean of trajectories.
+    """Compute EVD: the value lost by the learned behaviour, summed over a trajectory's states, mean of
+    trajectories.
 
     ``1/N sum_i sum_{s in y_i} |V^{pi(theta*_{b_i})}(s) - V^{pi(theta_{c_i})}(s)|`` with ``b_i`` a
     trajectory's behaviour and ``c_i`` its assigned component (section 7.2). Both policies are greedy, ties as
@@ -81,7 +82,7 @@ def expected_value_difference(
 def _losses(
     mdp: TabularMDP, true: Float[Array, "B K"], learned: Float[Array, "D K"]
 ) -> Float[Array, "B D S"]:
-    """``|V^* - V^pi|`` in every state, for each reward and each policy."""
+    """Compute ``|V^* - V^pi|`` in every state, for each reward and each policy."""
 
     def greedy(weights: Float[Array, " K"]) -> Float[Array, "S A"]:
         return deterministic_policy(hard_plan(mdp, reward_of(mdp, weights)).optimal)

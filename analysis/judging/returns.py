@@ -85,7 +85,7 @@ def reward_correlation(
     coverage: float = 0.95,
     resamples: int = RESAMPLES,
 ) -> RewardCorrelation:
-    """Correlation of a learned reward with the true one over held-out episodes (Table 7.4).
+    """Compute the correlation of a learned reward with the true one over held-out episodes (Table 7.4).
 
     Steps of one trajectory depend on each other, so of steps Fisher's interval is too narrow; the bootstrap
     draws whole trajectories. Sums of trajectories of unequal length go together by their length alone; take
@@ -119,7 +119,7 @@ def reward_correlation(
 
 
 def fisher_interval(r: float, n: int, coverage: float = 0.95) -> Interval:
-    """Interval of Pearson's correlation of ``n`` independent normal pairs (Fisher 1921)."""
+    """Compute the interval of Pearson's correlation of ``n`` independent normal pairs (Fisher 1921)."""
     if not abs(r) < 1:
         return Interval(r, r)
     half = stats.norm.ppf(0.5 + coverage / 2) / math.sqrt(n - 3)
@@ -133,7 +133,7 @@ def _correlation(
     counts: Float[np.ndarray, "B n"],
     coverage: float,
 ) -> Correlation:
-    """``owner`` says which trajectory each pair is of."""
+    """Compute correlations; ``owner`` holds the trajectory of each pair."""
     ranks = stats.rankdata(x), stats.rankdata(y)
     pearson, spearman = (_weighted(a, b, owner, np.ones_like(counts[:1]))[0] for a, b in ((x, y), ranks))
     drawn = [_weighted(a, b, owner, counts) for a, b in ((x, y), ranks)]
@@ -152,7 +152,7 @@ def _weighted(
     owner: Int[np.ndarray, " N"],
     counts: Float[np.ndarray, "B n"],
 ) -> Float[np.ndarray, " B"]:
-    """Pearson's correlation with each trajectory taken so many times."""
+    """Compute Pearson's correlation with given multiplicities of trajectories."""
     x, y = _standardised(x), _standardised(y)
     moments = (np.ones_like(x), x, y, x * x, y * y, x * y)
     sums = np.stack([np.bincount(owner, m, counts.shape[1]) for m in moments], 1)
@@ -194,8 +194,7 @@ def _percentiles(drawn: Float[np.ndarray, " B"], coverage: float) -> Interval:
 
 
 def action_agreement(space: ActionSpace, expert: np.ndarray, learner: np.ndarray) -> Float[np.ndarray, "..."]:
-    """Compute the agreement of two actions, in [0, 1]: ``1 - |a_E - a_L| / |a_max - a_min|``, or their
-    equality.
+    """Compute agreement of two actions, in [0, 1]: ``1 - |a_E - a_L| / |a_max - a_min|``, or their equality.
 
     Vectors ``[..., k]`` are cut to their bounds first, as an environment does.
     """
@@ -250,7 +249,9 @@ def behaviour_accuracies(
     episodes: int = 10,
     length: int | None = None,
 ) -> BehaviourAccuracy:
-    """LBA over what either policy meets in so many episodes, actions drawn, and over a box around them."""
+    """Compute LBA over the states that either policy meets in so many episodes, actions drawn, and over a box
+    around them.
+    """
     k_expert, k_learner, k_box = jax.random.split(key, 3)
     own = simulate(environment, expert, k_expert, episodes, length).visited
     met = simulate(environment, learner, k_learner, episodes, length).visited
@@ -269,7 +270,8 @@ def accuracy_of_cells(
     cells: int = 10,
     points: int = 10,
 ) -> Float[np.ndarray, "cells ..."]:
-    """LBA in every cell of a bounded space of states, ``cells`` a dimension (mountain car, section 7.4.3).
+    """Compute LBA in every cell of a bounded space of states, ``cells`` a dimension (mountain car, section
+    7.4.3).
 
     Each is the mean over a grid of ``points`` a dimension, and all cells are equally large, so LBA over the
     whole space is their mean. Raises ``ValueError`` for observations without bounds.
@@ -323,7 +325,7 @@ def bounded_ile(
     generated: Float[np.ndarray, "m U"],
     generated_live: Bool[np.ndarray, "m U"],
 ) -> EmpiricalILE:
-    """Empirical ILE of learned rewards bounded by a sigmoid: of noise-free demonstrations, and the learner's.
+    """Compute empirical ILE of rewards bounded by a sigmoid, of noise-free demonstrations and the learner's.
 
     Rewards are scaled by the mean and deviation of all of them (the released code: of the reward network's
     running ones) before the sigmoid. A trajectory's value is its mean over steps, which is in [0, 1] as in

@@ -81,7 +81,7 @@ def execute_notebook(
 
 
 def parameters_of(notebook: NotebookNode) -> dict[str, Any]:
-    """Names and values set in the cell tagged ``parameters``; empty where there is none.
+    """Read the names and values in the cell tagged ``parameters``; empty if there is none.
 
     Raises ``ValueError`` if the cell does anything but name literal values.
     """

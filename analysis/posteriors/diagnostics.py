@@ -119,7 +119,7 @@ def _listed(names: Any) -> str:
 
 
 def summary(idata: az.InferenceData, **options: Any) -> pd.DataFrame:
-    """ArviZ's summary of the weights, unrounded, and the number of divergent draws.
+    """Compute ArviZ's summary of the weights, unrounded, and the number of divergent draws.
 
     A row for each weight (``weights[near]``, or ``weights[20, near]`` by session) with ``mean``, ``sd``, the
     highest-density interval, ``mcse_mean``, ``mcse_sd``, ``ess_bulk``, ``ess_tail``, ``r_hat`` (NaN for a
@@ -166,7 +166,7 @@ def posterior_by_session(
     target_accept: float = 0.9,
     max_tree_depth: int = 10,
 ) -> az.InferenceData:
-    """Posteriors over the weights after so many sessions, each from all data up to then.
+    """Sample posteriors over the weights after so many sessions, each from all data up to then.
 
     All sessions share one compiled sampler: trajectories that a session has not met yet are padding to it.
     A session's draws do not depend on which other sessions are asked for.

@@ -46,7 +46,7 @@ def weights_by_session(
     theme: Theme = LIGHT,
     title: str = "",
 ) -> Figure:
-    """Posterior of each weight after so many sessions: median, the middle half, the middle ``coverage``.
+    """Draw posterior of each weight after so many sessions: median, the middle half, the middle ``coverage``.
 
     ``idata`` is of :func:`~i2rl.analysis.posteriors.diagnostics.posterior_by_session`. ``learned (session,
     feature)`` adds a learner's point estimates, ``run_history(...).sessions.weights``. Weights are in nats:
@@ -141,7 +141,7 @@ def forest_plot(
 
 
 def trace_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: str = "") -> Figure:
-    """Each weight's density by chain, and its draws in the order they came; divergent ones are ticked."""
+    """Draw each weight's density by chain, and its draws in order; divergent ones are ticked."""
     weights = require_posterior(idata)
     names, chains = _names(weights, most=_MOST_PANELS), weights.sizes["chain"]
     figure = new_figure(theme, 9.4, 1.1 + 1.15 * len(names))
@@ -207,7 +207,7 @@ def trace_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: str = ""
 
 
 def rank_plot(idata: az.InferenceData, *, bins: int = 20, theme: Theme = LIGHT, title: str = "") -> Figure:
-    """Ranks of each chain's draws among all draws: even where the chains explore the same distribution.
+    """Draw the ranks of each chain's draws among all draws, which are even for chains of one distribution.
 
     Every panel has its own scale, up to its highest bar. The band holds 95 % of the counts in one bin for
     independent draws. Raises ``ValueError`` for fewer than
@@ -252,7 +252,7 @@ def rank_plot(idata: az.InferenceData, *, bins: int = 20, theme: Theme = LIGHT, 
 
 
 def convergence_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: str = "") -> Figure:
-    """R-hat and effective sample sizes of each weight beside their recommended limits.
+    """Draw R-hat and effective sample sizes of each weight beside their recommended limits.
 
     Also of a posterior by session. Limits: 1.01, and 100 effective draws a chain (Vehtari and others 2021).
     """
@@ -366,7 +366,7 @@ def completion_frequencies(
 def predictive_plot(
     idata: az.InferenceData, *, coverage: float = 0.9, theme: Theme = LIGHT, title: str = ""
 ) -> Figure:
-    """Visits seen of each state against their posterior predictive interval, the most expected first.
+    """Draw visits seen of each state against their posterior predictive interval, the most expected first.
 
     ``idata`` is of :func:`~i2rl.analysis.posteriors.predictive.predictive_visits`. States never seen and
     hardly ever predicted (an interval of zero alone) are left out, and counted below.

@@ -39,7 +39,7 @@ _STATISTIC_DIMS = {"counts": ("state", "action"), "features": ("feature",), "sta
 def provenance(
     mdp: TabularMDP, method: str, configuration: Mapping[str, Any], seed: int | None = None
 ) -> dict[str, Any]:
-    """Attributes that say where results come from, all of types that NetCDF holds.
+    """Return the results' provenance as attributes, all of types that NetCDF holds.
 
     ``method``, ``configuration`` and ``library_versions`` (both JSON), ``i2rl_version``,
     ``mdp_fingerprint``, and ``seed`` where one is given.
@@ -204,7 +204,7 @@ def _history(
 
 
 def _trailing(name: str, count: int, known: Mapping[str, tuple[str, ...]]) -> tuple[str, ...]:
-    """Names of a variable's own dimensions, ArviZ's default ones where the field is none of ours."""
+    """Name a variable's own dimensions, by ArviZ's defaults for unknown fields."""
     dims = known.get(name, ())
     return dims if len(dims) == count else tuple(f"{name}_dim_{i}" for i in range(count))
 

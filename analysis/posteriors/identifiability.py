@@ -286,7 +286,7 @@ def _length(result: Identifiability) -> str:
 
 
 def directions_table(result: Identifiability) -> pd.DataFrame:
-    """One row a direction: its kind, wording, standard error and losses, then its coefficients."""
+    """Tabulate directions, one a row: kind, wording, standard error and losses, then coefficients."""
     rows = [
         {
             "kind": d.kind,

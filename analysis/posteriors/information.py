@@ -41,7 +41,8 @@ def policy_sensitivity(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Ar
 def complete_information(
     mdp: TabularMDP, weights: Float[Array, " K"], visits: Float[Array, " S"]
 ) -> Float[Array, "K K"]:
-    """Fisher information of fully observed behaviour, ``sum_s N(s) Cov_{a ~ pi(.|s)} d log pi(. | s)``.
+    """Compute the Fisher information of fully observed behaviour, ``sum_s N(s) Cov_{a ~ pi(.|s)} d log pi(. |
+    s)``.
 
     ``visits [S]`` are (expected) numbers of visits ``N(s)``.
     """
@@ -80,14 +81,14 @@ def _along(weights: Float[Array, "W K"], *given: Any) -> Float[Array, " W"]:
 def total_log_likelihoods(
     mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, "W K"], demonstration: Demonstration
 ) -> Float[np.ndarray, " W"]:
-    """Exact log-likelihood (nats) of the whole demonstration under each of several weights."""
+    """Compute the exact log-likelihood (nats) of the whole demonstration under each of several weights."""
     return np.asarray(_along(jnp.asarray(weights, float), *_given(mdp, sensor, demonstration)))
 
 
 def scores(
     mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, " K"], demonstration: Demonstration
 ) -> Float[np.ndarray, "n K"]:
-    """Gradient of each trajectory's exact log-likelihood, hidden steps summed out."""
+    """Compute the gradient of each trajectory's exact log-likelihood, hidden steps summed out."""
     gradients = _scores(jnp.asarray(weights, float), *_given(mdp, sensor, demonstration))
     return np.asarray(gradients)[: demonstration.n_trajectories]
 
@@ -95,7 +96,7 @@ def scores(
 def observed_information(
     mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, " K"], demonstration: Demonstration
 ) -> Float[np.ndarray, "K K"]:
-    """Minus the Hessian of the demonstration's exact log-likelihood, hidden steps summed out.
+    """Compute minus the Hessian of the demonstration's exact log-likelihood, hidden steps summed out.
 
     Differentiates through the soft plan by the implicit function theorem, twice. Need not be positive away
     from a maximum of the likelihood.
@@ -113,7 +114,7 @@ def expected_information(
     length: int,
     draws: int = 1000,
 ) -> Float[np.ndarray, "K K"]:
-    """Fisher information of ``trajectories`` of ``length`` steps of an expert with these weights.
+    """Compute the Fisher information of ``trajectories`` of ``length`` steps of an expert with these weights.
 
     ``trajectories E[score score']``, the expectation over observations averaged over ``draws`` simulated
     trajectories. Positive semidefinite.

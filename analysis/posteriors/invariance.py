@@ -123,7 +123,7 @@ def unidentified_directions(
 
 
 def _null_space(rows: Float[np.ndarray, "P K"], tolerance: float) -> Float[np.ndarray, "K m"]:
-    """Orthonormal basis of what all rows send to zero, as a root mean square over the rows."""
+    """Compute an orthonormal basis of the rows' null space, by root mean square over the rows."""
     triangle = np.linalg.qr(rows, mode="r")
     _, values, axes = np.linalg.svd(triangle, full_matrices=True)
     values = np.pad(values, (0, rows.shape[1] - len(values)))
@@ -131,7 +131,7 @@ def _null_space(rows: Float[np.ndarray, "P K"], tolerance: float) -> Float[np.nd
 
 
 def sparse_basis(basis: Float[np.ndarray, "K m"], tolerance: float) -> Float[np.ndarray, "K m"]:
-    """Another basis of the same space, of unit vectors that few features make up but for ``tolerance``.
+    """Find another basis of the same space, of unit vectors with few features, up to ``tolerance``.
 
     Takes the sparsest independent vectors by trying supports from small to large; where there are too many
     supports to try, what then remains is left as it is.
@@ -162,7 +162,7 @@ def sparse_basis(basis: Float[np.ndarray, "K m"], tolerance: float) -> Float[np.
 
 
 def _pivots(vectors: Float[np.ndarray, "K m"]) -> list[int]:
-    """One feature for each vector, as late as possible, such that the vectors are independent on them."""
+    """Find one feature for each vector, as late as possible, that make the vectors independent."""
     chosen: list[int] = []
     for k in reversed(range(len(vectors))):
         if np.linalg.matrix_rank(vectors[[*chosen, k]], tol=1e-3) > len(chosen):

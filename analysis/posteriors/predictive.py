@@ -143,7 +143,7 @@ def _expected_visits(
 
 
 def predictive_check(idata: az.InferenceData, coverage: float = 0.9) -> xr.Dataset:
-    """Observed visits against their posterior predictive distribution, with Bayesian p-values.
+    """Compare observed visits with their posterior predictive distribution, with Bayesian p-values.
 
     Returns
     -------

@@ -95,7 +95,9 @@ def caption(mdp: TabularMDP, content: Frame, columns: int = 10_000) -> str:
 def new_canvas(
     left: float, right: float, bottom: float, top: float, pixels: float, *, caption: float
 ) -> Axes:
-    """Axes that fill a figure, so many pixels a unit, with so many units for the caption below ``bottom``."""
+    """Make axes that fill a figure, so many pixels a unit, with so many units for the caption below
+    ``bottom``.
+    """
     down = caption if top > bottom else -caption
     width, height = abs(right - left), abs(top - bottom) + caption
     figure = Figure(figsize=(width * pixels / DPI, height * pixels / DPI), dpi=DPI, facecolor=PAGE)

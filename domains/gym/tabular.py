@@ -153,5 +153,5 @@ class TabularEnv(gymnasium.Env[int, int]):
 
 
 def drawn(cumulative: np.ndarray, uniform: float) -> int:
-    """Index of a draw by its cumulative probabilities; never one of probability zero."""
+    """Draw an index by its cumulative probabilities, never one of probability zero."""
     return int(np.searchsorted(cumulative, uniform * cumulative[-1], side="right"))

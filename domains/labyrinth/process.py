@@ -122,7 +122,7 @@ class Labyrinth(NamedTuple):
         return named._replace(names=names)
 
     def below(self, node: int) -> Bool[np.ndarray, " S"]:
-        """States in the part of the maze that begins at ``node``."""
+        """Return states in the part of the maze that begins at ``node``."""
         inside = np.zeros(N_NODES + 1, bool)
         for n in range(node, N_NODES):
             inside[n] = n == node or inside[parent_of(n)]
@@ -154,8 +154,7 @@ def mouse_labyrinth(discount: float = 0.9) -> Labyrinth:
 
 @cache
 def labyrinth_by_level(discount: float = 0.9) -> Labyrinth:
-    """Build the labyrinth with further features: turning round and going deeper, from each level (145 in
-    all).
+    """Build labyrinth with further features: turning round and going deeper, from each level (145 in all).
 
     A reward that is stationary and linear in the features of :func:`labyrinth` asks for one propensity to
     turn and one to go deeper everywhere. This one lets them differ from level to level.
@@ -318,7 +317,7 @@ def _check_frames(frames: Any, n_nodes: int, where: str) -> None:
 
 
 def pairs_of(maze: Labyrinth, nodes: Sequence[int]) -> tuple[Int[np.ndarray, " L"], Int[np.ndarray, " L"]]:
-    """States and actions ``[len(nodes) - 1]`` of a valid sequence of nodes that begins at node 0."""
+    """Return states and actions ``[len(nodes) - 1]`` of a valid sequence of nodes that begins at node 0."""
     successors = np.asarray(maze.mdp.successors)[..., 0]
     available = np.asarray(maze.mdp.available)
     leads_to = np.where(available, maze.node[successors], -1)
@@ -340,7 +339,7 @@ def nodes_of(
 
 
 def demonstration_of(maze: Labyrinth, bouts: Sequence[Bout]) -> Demonstration:
-    """Bouts as fully observed trajectories, one a row; ``ValueError`` if there are none."""
+    """Return bouts as fully observed trajectories, one a row; ``ValueError`` if there are none."""
     return concatenate([Demonstration.from_pairs(*pairs_of(maze, bout.nodes)) for bout in bouts])
 
 
@@ -371,7 +370,7 @@ def _simulate(
 def simulate_bouts(
     key: Array, maze: Labyrinth, weights: Float[np.ndarray, " K"], n: int, max_steps: int = 512
 ) -> list[Bout]:
-    """Bouts of a mouse that follows the soft policy of ``weights [K]``.
+    """Simulate bouts of a mouse that follows the soft policy of ``weights [K]``.
 
     A bout that has not come home after ``max_steps`` steps is cut off there, as by the end of a recording.
     """

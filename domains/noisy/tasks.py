@@ -291,8 +291,7 @@ def _stationary(mdp: TabularMDP, policy: Float[np.ndarray, "S A"]) -> Float[np.n
 def agreement_probabilities(
     noise: AnySensor, predicates: np.ndarray | Array, weights: np.ndarray | Array
 ) -> Float[np.ndarray, " J"]:
-    """Compute the probability that a predicate of an observation is that of the truth, under ``weights [S,
-    A]``.
+    """Compute probability that a predicate of an observation is that of the truth, under ``weights [S, A]``.
 
     ``predicates [J, S, A]`` may be labels. The sum over observations is exact; ``weights`` need not be
     normalised. These probabilities judge an estimated sensor: the reliabilities of :class:`FeatureNoise` are
@@ -455,7 +454,7 @@ def _clarity(
     observation: Int[np.ndarray, "n L"],
     concentration: float,
 ) -> Float[np.ndarray, "n L"]:
-    """Scores given what happened: the clarity's distribution once it is known whether a swap happened."""
+    """Draw scores given the errors: the clarity's distribution given whether a swap happened."""
     g, o = truth.reshape(-1), observation.reshape(-1)
     if isinstance(noise, SwapNoise):
         wrong = np.asarray(noise.confused(jnp.asarray(g), jnp.asarray(o)))

@@ -180,7 +180,7 @@ def current_beliefs(
     codes: Int[Array, "P L 3"],
     watcher: Watcher = watch,
 ) -> Float[Array, "P S"]:
-    """Belief about each patroller's state after the ``L`` steps perceived of it, from ``mdp.initial`` on."""
+    """Compute the belief about each patroller's state after ``L`` observed steps, from ``mdp.initial`` on."""
 
     def one(log_policy: Float[Array, "S A"], codes: Int[Array, "L 3"]) -> Float[Array, " S"]:
         def step(belief: Float[Array, " S"], code: Int[Array, " 3"]) -> tuple:
@@ -203,7 +203,7 @@ class IndependentForecast(NamedTuple):
         beliefs: Float[Array, "P S"],
         horizon: int,
     ) -> Float[Array, "P T S"]:
-        """``P(s_t)`` of each patroller for ``t = 0..horizon-1``; step 0 is the belief itself."""
+        """Compute ``P(s_t)`` of each patroller for ``t = 0..horizon-1``; step 0 is the belief itself."""
         del key, cells
         chains = jax.vmap(mdp.state_transitions)(jnp.exp(log_policies))
 
@@ -247,7 +247,7 @@ Forecast = IndependentForecast | SimulatedForecast
 
 
 def detection_probability(sees: Float[Array, "C S"], marginals: Float[Array, "P T S"]) -> Float[Array, "T C"]:
-    """``1 - prod_i (1 - d_i)``: that some patroller sees the cell at that step, taken as independent."""
+    """Compute ``1 - prod_i (1 - d_i)``, the probability of detection by independent patrollers."""
     return 1 - jnp.prod(1 - jnp.einsum("cs,pts->ptc", sees, marginals), axis=0)
 
 

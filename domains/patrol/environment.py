@@ -134,7 +134,8 @@ class BreachEnv(gymnasium.Env[np.ndarray, int]):
         return states.copy()
 
     def step(self, action: int) -> tuple[Int[np.ndarray, " 1+P"], float, bool, bool, dict[str, Any]]:
-        """One step of everybody: what is seen, the reward, whether it is over, False, and ``action_mask``.
+        """Simulate one step of all: the observation, the reward, whether the episode is over, False, and
+        ``action_mask``.
 
         Raises ``ValueError`` for an action that does not exist; ``gymnasium.error.ResetNeeded`` before the
         first reset and after the end.
@@ -166,7 +167,7 @@ class BreachEnv(gymnasium.Env[np.ndarray, int]):
             self._ended = CAUGHT
 
     def _patrol_on(self) -> None:
-        """One step of the patrollers, as :func:`i2rl.domains.simulate_patrol`."""
+        """Simulate one step of the patrollers, as :func:`i2rl.domains.simulate_patrol`."""
         states = self._patrollers
         assert states is not None
         here, before = self._cell_of_state[states], self._before

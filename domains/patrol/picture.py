@@ -45,7 +45,7 @@ def patrol_scene(patrol: Patrol) -> Scene:
 def draw_floor(
     cells: Sequence[tuple[int, int]], marks: Sequence[tuple[str, str, str]], lines: int = 1
 ) -> tuple[Axes, int]:
-    """Axes with floor where the cells are and wall elsewhere, a key, and how many characters fit in a line.
+    """Make axes with floor at the cells and wall elsewhere, a key, and a number of characters a line.
 
     ``marks`` are the key's, in so many ``lines``.
     """

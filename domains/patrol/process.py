@@ -145,7 +145,7 @@ def _optimal(mdp: TabularMDP, weights: Float[Array, " K"]) -> Bool[Array, "S A"]
 
 
 def break_ties(optimal: Bool[np.ndarray, "S A"]) -> Float[np.ndarray, "S A"]:
-    """One optimal action per state, in the order forward, right, left, stop."""
+    """Return one optimal action per state, in the order forward, right, left, stop."""
     order = np.array(_TIE_ORDER)
     chosen = order[np.argmax(optimal[:, order], axis=1)]
     return np.eye(len(ACTIONS))[chosen]
@@ -170,7 +170,8 @@ def simulate_patrol(
     steps: int,
     interaction: Interaction = Interaction(),  # noqa: B008 (immutable)
 ) -> tuple[Int[Array, "P T"], Int[Array, "P T"]]:
-    """States and actions of all patrollers over ``steps``, passing each other by the interaction's rule.
+    """Simulate states and actions of all patrollers over ``steps``, who pass each other by the interaction's
+    rule.
 
     Two patrollers meet when they share a cell or one stands where the other just was. A waiting patroller
     is recorded as stopping.
@@ -346,7 +347,7 @@ def _grid_states(cells: frozenset[Cell]) -> tuple[State, ...]:
 
 @cache
 def four_hallways() -> Patrol:
-    """Instance 1: one patroller visits the ends of four hallways in turn (192 states).
+    """Build instance 1: one patroller visits the ends of four hallways in turn (192 states).
 
     The released map has 200 states; this reconstruction shortens its corridor by one cell, which gives the
     192 of the dissertation (25 cells in four phases of 13, 11, 13 and 11). A feature fires on the step that
@@ -392,7 +393,7 @@ def four_hallways() -> Patrol:
 
 @cache
 def boyd_fifth_floor() -> Patrol:
-    """Instance 2: two patrollers in a hallway with a short arm at either end (124 states).
+    """Build instance 2: two patrollers in a hallway with a short arm at either end (124 states).
 
     The intended move succeeds with probability 0.95. Turning features overlap as in the released code:
     cells (1,1) and (15,1) belong to hallway and corner, (0,2) and (16,2) to corner and first division.
@@ -447,7 +448,7 @@ def boyd_fifth_floor() -> Patrol:
 
 @cache
 def boyd_with_rooms() -> Patrol:
-    """Instance 3: two patrollers in hallways with two rooms they avoid (184 states).
+    """Build instance 3: two patrollers in hallways with two rooms they avoid (184 states).
 
     The turning feature fires on left turns in the hallways only, as in the released code (the dissertation
     says any turn). The learner's start, (0,17) facing west, is a reconstruction.
@@ -522,7 +523,7 @@ def boyd_with_rooms() -> Patrol:
 
 
 def instance(number: int) -> Patrol:
-    """Patrol instance 1, 2 or 3."""
+    """Build patrol instance 1, 2 or 3."""
     builders = {1: four_hallways, 2: boyd_fifth_floor, 3: boyd_with_rooms}
     if number not in builders:
         raise ValueError(f"patrol instances are 1, 2 and 3, got {number}")

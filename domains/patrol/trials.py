@@ -385,14 +385,16 @@ def _trials(
 
 
 def greedy_policies(patrol: Patrol, weights: Float[np.ndarray, "P K"]) -> Float[Array, "P S A"]:
-    """Log-policies optimal under each patroller's learned weights; ties as in the patrollers' own policy."""
+    """Compute log-policies optimal under each patroller's learned weights; ties as in the patrollers' own
+    policy.
+    """
 
     policies = [greedy_policy(patrol.mdp, w) for w in np.asarray(weights, float)]
     return jnp.log(jnp.asarray(np.stack(policies)))
 
 
 def soft_policies(patrol: Patrol, weights: Float[np.ndarray, "P K"]) -> Float[Array, "P S A"]:
-    """Soft log-policies under each patroller's learned weights."""
+    """Compute soft log-policies under each patroller's learned weights."""
     return _soft(patrol.mdp, jnp.asarray(weights, float))
 
 

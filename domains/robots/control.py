@@ -34,7 +34,7 @@ _SLOPE = 0.0025
 
 
 def cart_pole(horizon: int = 500) -> Environment:
-    """CartPole-v1: 2 actions push the cart left or right; one point for each step until the pole falls.
+    """Build CartPole-v1: 2 actions push the cart left or right; one point for each step until the pole falls.
 
     Observations are the cart's position (m) and velocity (m/s), the pole's angle (rad) and its velocity
     (rad/s). An episode terminates beyond 2.4 m or 12 degrees.
@@ -55,7 +55,7 @@ def cart_pole(horizon: int = 500) -> Environment:
 
 
 def mountain_car(horizon: int = 200) -> Environment:
-    """MountainCar-v0: 3 actions push left, not at all, or right; every step costs one until the flag.
+    """Build MountainCar-v0: 3 actions push left, not at all, or right; every step costs one until the flag.
 
     Observations are the position, in [-1.2, 0.6], and the velocity, in [-0.07, 0.07] a step. An episode
     terminates at a position of 0.5 or more that is not left again.

@@ -149,7 +149,7 @@ def train_expert(
 
 
 def demonstrate_expert(task: Task, policy: Policy, key: Array, n: int) -> Demonstrations:
-    """``n`` episodes of the policy's likeliest actions, without noise, as they are executed."""
+    """Simulate ``n`` episodes of the policy's likeliest actions, without noise, as they are executed."""
     episodes = play(task, policy, key, n, deterministic=True)
     live = np.arange(episodes.actions.shape[1]) < np.asarray(episodes.lengths)[:, None]
     longest = int(max(episodes.lengths))

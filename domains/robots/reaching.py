@@ -94,7 +94,7 @@ def scene(observations: Float[Array, "... 29"]) -> Scene:
 
 
 def arm(wrist: Float[Array, "... 3"]) -> tuple[Float[Array, "... 3"], Float[Array, "... 3"]]:
-    """Shoulder and elbow of a wrist, by inverse kinematics of two links; see the module's text."""
+    """Compute shoulder and elbow of a wrist, by inverse kinematics of two links; see the module's text."""
     rest, hint = (jnp.asarray(x, wrist.dtype) for x in (_SHOULDER, _BEND))
     reach = jnp.linalg.norm(wrist - rest, axis=-1, keepdims=True)
     toward = (wrist - rest) / reach
@@ -248,7 +248,7 @@ class OnionMover(NamedTuple):
         return self._limited(way, jnp.asarray(_LONGEST, way.dtype))
 
     def sample(self, key: Array, observations: Float[Array, "... 29"]) -> Float[Array, "... 3"]:
-        """Actions drawn."""
+        """Draw actions."""
         way, looking = _way(observations)
         k_look, k_wobble, k_length, k_unsteady = jax.random.split(key, 4)
         batch, dtype = way.shape[:-1], way.dtype
@@ -262,7 +262,7 @@ class OnionMover(NamedTuple):
         return jnp.where(stays[..., None], self._limited(about, longest), moved)
 
     def _limited(self, way: Array, longest: Array) -> Array:
-        """In the environment's units, no longer than ``longest`` metres or the bounds."""
+        """Convert to the environment's units, cut to ``longest`` metres and the bounds."""
         length = jnp.linalg.norm(way, axis=-1, keepdims=True)
         way = way * jnp.minimum(1, longest / jnp.maximum(length, 1e-9)) / jnp.asarray(self.stride, way.dtype)
         return way / jnp.maximum(jnp.max(jnp.abs(way), -1, keepdims=True), 1)
@@ -302,5 +302,5 @@ def _way(observations: Float[Array, "... 29"]) -> tuple[Float[Array, "... 3"], B
 def demonstrate_onions(
     key: Array, n: int, stride: float = STRIDE, looking: float = _LOOKING_ON
 ) -> Trajectories:
-    """``n`` synthetic recordings: actions drawn from the mover in :func:`onion_reaching` of this stride."""
+    """Simulate ``n`` synthetic recordings: actions drawn from the mover in :func:`onion_reaching`."""
     return simulate(onion_reaching(stride), OnionMover(stride, looking), key, n)

@@ -27,11 +27,11 @@ class Behaviour(Protocol):
     """Policy that acts: a policy network, or any JAX pytree with its two functions."""
 
     def mode(self, observations: Array) -> Array:
-        """Deterministic actions of observations ``[..., d]``."""
+        """Compute deterministic actions of observations ``[..., d]``."""
         ...
 
     def sample(self, key: Array, observations: Array) -> Array:
-        """Actions drawn."""
+        """Draw actions."""
         ...
 
 
@@ -54,7 +54,7 @@ class Perturbed(_PerturbedFields):
         return self.policy.mode(observations)
 
     def sample(self, key: Array, observations: Array) -> Array:
-        """Actions drawn."""
+        """Draw actions."""
         k_own, k_any, k_which = jax.random.split(key, 3)
         space, batch = self.policy.actions, observations.shape[:-1]
         anything = jax.random.bernoulli(k_which, jnp.asarray(self.share, float), batch)
@@ -132,7 +132,7 @@ def graded_mix(
     episodes: int,
     length: int | None = None,
 ) -> tuple[Trajectories, Int[np.ndarray, " n"]]:
-    """Held-out episodes of policies of graded quality, as many of each, and whose each is.
+    """Simulate held-out episodes of policies of graded quality, as many of each; return the policy of each.
 
     Rewards are compared over all of them: over one policy's states alone hardly any reward varies.
     ``[Perturbed(policy, level) for level in LEVELS]`` is such a grading.

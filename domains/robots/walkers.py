@@ -126,7 +126,7 @@ class Locomotion(NamedTuple):
     def step(
         self, states: Float[np.ndarray, "n D"], actions: Float[np.ndarray, "n k"]
     ) -> tuple[Float[np.ndarray, "n D"], Float[np.ndarray, " n"], Bool[np.ndarray, " n"]]:
-        """Next states, Gymnasium's rewards, and whether the episode is over.
+        """Compute the next states, Gymnasium's rewards, and whether the episode is over.
 
         Raises ``ValueError`` for other shapes, and for numbers that are not finite or beyond 10⁶.
         """

@@ -139,11 +139,13 @@ class Tally(NamedTuple):
         return tp, fp, tn, fn
 
     def precision(self, level: float = 0.95) -> Share:
-        """Share of blemished onions among those in the bin, ``TP / (TP + FP)``; NaN if none was binned."""
+        """Compute the share of blemished onions among those in the bin, ``TP / (TP + FP)``; NaN if none was
+        binned.
+        """
         return _ratio(self.true_positives, self.true_positives + self.false_positives, level)
 
     def recall(self, level: float = 0.95) -> Share:
-        """Share of the blemished onions that are in the bin, ``TP / (TP + FN)``."""
+        """Compute the share of the blemished onions that are in the bin, ``TP / (TP + FN)``."""
         return _ratio(self.true_positives, self.true_positives + self.false_negatives, level)
 
 
@@ -159,7 +161,7 @@ def wilson(successes: float, trials: float, level: float = 0.95) -> Share:
 
 
 def _ratio(part: Int[np.ndarray, " n"], whole: Int[np.ndarray, " n"], level: float) -> Share:
-    """Ratio of sums over belts, with Wilson's interval for the effective number of onions.
+    """Compute the ratio of sums over belts, with Wilson's interval for the effective number of onions.
 
     Onions of one belt are not independent. The delta method gives the variance of the ratio; Wilson's formula
     takes the number of independent onions of that variance (Korn and Graubard 1998). If no belt differs from

@@ -165,7 +165,7 @@ def sorting_without_claiming() -> Sorting:
 
 @cache
 def pick_inspect_place() -> Sorting:
-    """22 states, 36 pairs, no list: the process of the noisy-perception experiments (section 7.1.2).
+    """Build the process of the noisy-perception experiments (section 7.1.2): 22 states, 36 pairs, no list.
 
     One behaviour, with the weights the authors used for it, of L1 norm one (they divided by 14.3, which
     changes no policy). The features about the list are always zero. The first onion is an unknown one on
@@ -262,7 +262,7 @@ def _places(state: State) -> tuple[int, ...] | None:
 
 
 def _with_list(state: State, before_list: tuple[int, ...], without_list: tuple[int, ...]) -> tuple[int, ...]:
-    """Actions of the processes with a list: before one is made, and where none is."""
+    """Return actions of the processes with a list, before one is made and without one."""
     onion, prediction, _, listed = state
     placed = _places(state)
     if placed is not None:
@@ -374,7 +374,9 @@ def _sorting(
 
 
 def _may_start(state: State, states: tuple[State, ...]) -> bool:
-    """Before a list was made or, where there is none, with an unknown onion on the table."""
+    """Test whether a state may be a start: before a list was made or, without lists, with an unknown onion on
+    the table.
+    """
     if any(other.listed == EMPTY for other in states):
         return state.onion == TABLE and state.listed == EMPTY
     return state.onion == TABLE and state.prediction == UNKNOWN

@@ -32,7 +32,7 @@ RUNS = 21
 
 
 def measured(name: str) -> dict[str, float]:
-    """Milliseconds of each part, for a task of :mod:`i2rl.analysis.studies.adversarial.cases`."""
+    """Measure milliseconds of each part, for a task of :mod:`i2rl.analysis.studies.adversarial.cases`."""
     of = case(name)
     task = of.environment
     truth = of.truth(draws=4)

@@ -81,7 +81,7 @@ class Growth(NamedTuple):
 
 
 def stream_of(task: NoisyTask, sessions: int, trajectories: int = 2, steps: int = 3, seed: int = 0) -> Stream:
-    """Scored observations of a noisy task."""
+    """Simulate scored observations of a noisy task."""
     drawn = demonstrate_noisy(
         jax.random.key(seed),
         task,
@@ -119,7 +119,7 @@ def random_stream(size: int, predicates: int, sessions: int, *, named: bool = Fa
 def interleaved_seconds(
     learners: Mapping[str, Learner], stream: Stream
 ) -> dict[str, Float[np.ndarray, " sessions"]]:
-    """Wall-clock seconds of ``update`` for every session after the first few, by learner.
+    """Measure wall-clock seconds of ``update`` for every session after the first few, by learner.
 
     Whose turn is first changes from session to session.
     """
@@ -139,7 +139,7 @@ def interleaved_seconds(
 def ratio_of_medians(
     one: Float[np.ndarray, " n"], other: Float[np.ndarray, " n"], draws: int = 2000, seed: int = 0
 ) -> tuple[float, float, float]:
-    """Ratio of medians of paired times, and its 95 % interval by bootstrap over pairs."""
+    """Compute the ratio of medians of paired times, and its 95 % interval by bootstrap over pairs."""
     rows = np.random.default_rng(seed).integers(0, len(one), (draws, len(one)))
     ratios = np.median(one[rows], 1) / np.median(other[rows], 1)
     low, high = np.quantile(ratios, (0.025, 0.975))
@@ -159,7 +159,7 @@ def growth(sizes: Sequence[int], medians: Sequence[float]) -> Growth:
 
 
 def measured_growth(sizes: Sequence[int], make: Callable[[int], Stream]) -> dict[str, Growth]:
-    """Growth of RIMEO's and RIFOM's session with the streams that ``make`` makes of each size."""
+    """Measure growth of RIMEO's and RIFOM's session with the streams that ``make`` makes of each size."""
     medians: dict[str, list[float]] = {REPORTED: [], COUNTED: []}
     for size in sizes:
         stream = make(size)
@@ -173,7 +173,7 @@ def measured_growth(sizes: Sequence[int], make: Callable[[int], Stream]) -> dict
 
 
 def session_seconds(task: NoisyTask, sessions: int) -> dict[str, dict[str, float]]:
-    """Seconds of a session by learner, and how many times RIFOM's."""
+    """Measure seconds of a session by learner, and how many times RIFOM's."""
     stream = stream_of(task, sessions + WARM)
     mdp, psi = stream.mdp, stream.predicates
     spent = interleaved_seconds(
@@ -200,7 +200,7 @@ def session_seconds(task: NoisyTask, sessions: int) -> dict[str, dict[str, float
 
 
 def part_seconds(task: NoisyTask, sessions: int = 20, replications: int = 200) -> dict[str, float]:
-    """Seconds of each part of RIMEO's session, with scores step by step, compiled alone.
+    """Measure seconds of each part of RIMEO's session, with scores step by step, compiled alone.
 
     At the state that a learner is in after ``sessions``. Reports are prepared once, the two fits occur
     as often as a session alternates (twice by default), the others once more.
@@ -256,7 +256,7 @@ def part_seconds(task: NoisyTask, sessions: int = 20, replications: int = 200) -
 def pattern_seconds(
     predicates: Sequence[int] = (2, 4, 8, 12, 16), size: int = 5
 ) -> dict[str, dict[str, float]]:
-    """Classes, patterns of agreement and seconds of one fit of the sensor, against random predicates."""
+    """Measure classes, patterns of agreement and seconds of one sensor fit, against random predicates."""
     found = {}
     for number in predicates:
         stream = random_stream(size, number, 1)

@@ -57,7 +57,7 @@ def _peak_mib() -> float:
 
 
 def measure(n_states: int, discount: float) -> dict[str, float]:
-    """Seconds, peak memory of this process (MiB) and Bellman residual of one size.
+    """Measure seconds, peak memory of this process (MiB) and Bellman residual of one size.
 
     ``plan_seconds`` is by the wall clock once compiled; ``plan_cpu_seconds``, of all cores, is the cost on a
     busy machine too.

@@ -68,7 +68,7 @@ def ipopt_iterations(sessions: int, seed: int = 0) -> dict[str, Any]:
 
 
 def steady_cost(sessions: int = 1000, window: int = 50) -> dict[str, float]:
-    """Median time of a session around the 10th and around the last, and memory growth in MiB."""
+    """Measure the median time of a session around the 10th and around the last, and memory growth in MiB."""
     patrol = instance(2)
     demonstration = demonstrate(jax.random.key(1), patrol, 30, sessions + window)[0]
     learner = lme_i2rl(patrol.mdp, patrol.visibility(30))
@@ -91,7 +91,8 @@ def steady_cost(sessions: int = 1000, window: int = 50) -> dict[str, float]:
 
 
 def online_against_batch(sessions: int, replications: int, rerun_points: int = 12) -> dict[str, float]:
-    """Cumulative seconds of online sessions, of one batch run, and of batch re-run after every session.
+    """Measure cumulative seconds of online sessions, of one batch run, and of batch re-run after every
+    session.
 
     Re-running is measured at ``rerun_points`` evenly spread sessions (shapes compiled first) and summed by
     interpolation between them.
@@ -139,7 +140,7 @@ def ring(n_states: int, n_actions: int = 4, n_features: int = 6, seed: int = 0) 
 
 
 def session_cost(mdp: TabularMDP, length: int, trajectories: int, sessions: int = 12) -> float:
-    """Median seconds of one E- and M-step of a session, with a third of the states in view."""
+    """Measure the median seconds of one E- and M-step of a session, with a third of the states in view."""
     view = Visibility(np.arange(mdp.n_states) < mdp.n_states // 3)
     weights = jnp.linspace(-1, 1, mdp.n_features)
     policy = soft_plan(mdp, reward_of(mdp, weights)).log_policy

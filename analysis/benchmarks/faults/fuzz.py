@@ -83,7 +83,7 @@ class Tally(NamedTuple):
 
 
 def tiny_process() -> TabularMDP:
-    """Three named states and two named actions."""
+    """Build a process of three named states and two named actions."""
     return TabularMDP.from_successors(
         np.zeros((3, 2, 1), int),
         np.ones((3, 2, 1)),

@@ -213,7 +213,7 @@ def killed_at(call: str, n: int, path: Path, action: Callable[[], object]) -> bo
 
 
 def _folders(folder: Path, name: str) -> Iterator[Path]:
-    """Paths for one journal after the other."""
+    """Return paths for one journal after the other."""
     i = 0
     while True:
         (folder / f"{name}-{i}").mkdir()

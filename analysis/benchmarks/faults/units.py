@@ -63,7 +63,7 @@ KINDS = ("normal", "constant", "duplicate")
 
 @cache
 def process() -> TabularMDP:
-    """Four states, three actions and three features of about one."""
+    """Build a process of four states, three actions and three features of about one."""
     rng = np.random.default_rng(1)
     mdp = TabularMDP.from_successors(
         rng.integers(0, 4, (4, 3, 2)),
@@ -95,7 +95,7 @@ def greedy_policy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, 
 
 @cache
 def demonstration(sensor: str = "clear") -> Demonstration:
-    """Twelve trajectories of the expert, seen clearly, half hidden, or through noise."""
+    """Simulate twelve trajectories of the expert, seen clearly, half hidden, or through noise."""
     seen: dict[str, AnySensor] = {"clear": Sensor(), "hidden": VIEW, "noisy": NOISE}
     weights = jnp.asarray(TRUTH / feature_scale(process()))
     return sample_demonstration(jax.random.key(3), TrajectoryLaw(process(), weights, seen[sensor], 6), 12)
@@ -109,7 +109,7 @@ def target(mdp: TabularMDP) -> FeatureTarget:
 
 @cache
 def counts() -> Float[np.ndarray, "S A"]:
-    """About 500 visits of the expert's."""
+    """Simulate about 500 visits of the expert."""
     expert = policy(process(), jnp.asarray(TRUTH / feature_scale(process())))
     return np.random.default_rng(0).poisson(50 * np.asarray(occupancy(process(), expert))).astype(float)
 
@@ -190,7 +190,7 @@ SAMPLERS = ("dpm_birl", "birl")
 
 
 def units_of(name: str, number: int, seed: int = 0) -> Float[np.ndarray, "number K"]:
-    """Units from 1e-9 to 1e9: all small, all large, then mixed at random."""
+    """Return units from 1e-9 to 1e9: all small, all large, then mixed at random."""
     exponents = np.random.default_rng(seed).uniform(-9, 9, (max(number - 2, 0), 3))
     exponents = np.concatenate([np.full((1, 3), -9.0), np.full((1, 3), 9.0), exponents])[:number]
     if name in SAMPLERS:
@@ -229,7 +229,9 @@ def difference(name: str, units: Float[np.ndarray, "number K"]) -> Difference:
 
 
 def random_process(seed: int, kind: str) -> TabularMDP:
-    """Ten states, three actions, three normal features, of which the last may be constant or a duplicate."""
+    """Build a process of ten states, three actions, three normal features, the last perhaps constant or a
+    duplicate.
+    """
     rng = np.random.default_rng(seed)
     features = rng.normal(size=(10, 3, 3))
     if kind == "constant":

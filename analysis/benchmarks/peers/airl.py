@@ -61,7 +61,7 @@ class Peer:
         self.versions = self._answer()
 
     def run(self, setting: Setting, demonstrations: Path, seed: int) -> dict[str, float]:
-        """Seconds and return of one run."""
+        """Measure seconds and return of one run."""
         assert self._process.stdin is not None
         request = {**setting._asdict(), "demonstrations": str(demonstrations), "seed": seed}
         self._process.stdin.write(json.dumps(request) + "\n")
@@ -81,7 +81,7 @@ class Peer:
 
 
 def ours(agent: PPO, setting: Setting, episodes: Episodes, seed: int, **training: Any) -> dict[str, float]:
-    """Seconds and return of one run of ours."""
+    """Measure seconds and return of one run of ours."""
     environment = agent.environment
     kept = [slice(0, n) for n in episodes.lengths]
     reports = recording(

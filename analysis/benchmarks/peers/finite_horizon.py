@@ -80,7 +80,7 @@ def random_problem(n_states: int, seed: int, tolerance: float) -> dict[str, np.n
 
 
 def transition_matrix(problem: dict[str, np.ndarray]) -> sparse.csr_array:
-    """``P(s' | s, a)`` as a sparse matrix ``[S * A, S]``."""
+    """Compute ``P(s' | s, a)`` as a sparse matrix ``[S * A, S]``."""
     n_states, n_actions, width = problem["successors"].shape
     rows = np.repeat(np.arange(n_states * n_actions), width)
     return sparse.csr_array(
@@ -90,7 +90,7 @@ def transition_matrix(problem: dict[str, np.ndarray]) -> sparse.csr_array:
 
 
 def state_visits(problem: dict[str, np.ndarray], policy: np.ndarray) -> np.ndarray:
-    """``P(s_t = s)`` of a policy ``[T, S, A]`` for ``t = 0 .. T``, as ``[T + 1, S]``."""
+    """Compute ``P(s_t = s)`` of a policy ``[T, S, A]`` for ``t = 0 .. T``, as ``[T + 1, S]``."""
     backwards = transition_matrix(problem).T.tocsr()
     states = [problem["initial"]]
     for step in policy:
@@ -99,7 +99,7 @@ def state_visits(problem: dict[str, np.ndarray], policy: np.ndarray) -> np.ndarr
 
 
 def final_gap(problem: dict[str, np.ndarray], policy: np.ndarray) -> float:
-    """Largest difference of any state's visits, over all 51 times, from the demonstrator's."""
+    """Compute the largest difference of any state's visits, over all 51 times, from the demonstrator's."""
     return float(np.abs(state_visits(problem, policy).sum(0) - problem["visits_and_last"]).max())
 
 
@@ -165,7 +165,7 @@ class Side:
         self.versions: dict[str, str] = self._answer()
 
     def solve(self, source: Path, problem: dict[str, np.ndarray]) -> dict[str, float]:
-        """Wall and processor seconds, gradient evaluations and the judge's gap of one run."""
+        """Measure wall and processor seconds, gradient evaluations and the judge's gap of one run."""
         assert self._process.stdin is not None
         self._process.stdin.write(f"{source} {self._result}\n")
         self._process.stdin.flush()

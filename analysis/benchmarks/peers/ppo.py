@@ -83,7 +83,7 @@ class Trainer(Side):
 
 
 def serve() -> None:
-    """Our side: answer requests from standard input, one JSON line each."""
+    """Answer requests to our side from standard input, one JSON line each."""
     # Imported here: the process that hands out the work needs neither JAX nor the package's models.
     import jax
 
@@ -117,24 +117,24 @@ def serve() -> None:
 
 
 def mean_return(returns: np.ndarray, episodes: np.ndarray) -> float:
-    """Mean over all episodes, of means over some."""
+    """Compute the mean over all episodes, of means over some."""
     return float(np.nansum(returns * episodes) / episodes.sum())
 
 
 def latest(returns: np.ndarray, episodes: np.ndarray, count: int = 100) -> tuple[np.ndarray, np.ndarray]:
-    """Means, and how many of their episodes are among the last ``count``."""
+    """Compute means, and how many of their episodes are among the last ``count``."""
     later = np.cumsum(episodes[::-1])[::-1] - episodes
     return returns, np.clip(count - later, 0, episodes)
 
 
 def interval(values: list[float]) -> tuple[float, float]:
-    """Mean, and half the width of its 95 % interval."""
+    """Compute the mean, and half the width of its 95 % interval."""
     half = stats.t.ppf(0.975, len(values) - 1) * stats.sem(values)
     return float(np.mean(values)), float(half)
 
 
 def difference(ours: list[float], peers: list[float]) -> tuple[float, float]:
-    """95 % interval of the difference of two means, by Welch's t."""
+    """Compute the 95 % interval of the difference of two means, by Welch's t."""
     if np.ptp(ours) == np.ptp(peers) == 0:
         gap = float(np.mean(ours) - np.mean(peers))
         return gap, gap

@@ -27,7 +27,7 @@ from ..harness import print_table, publish
 def accuracies(
     number: int, observability: int, points: tuple[int, ...], replications: int, statistics: tuple[str, ...]
 ) -> dict[str, Float[np.ndarray, "replications points"]]:
-    """LBA of each method at each number of sessions; a run is a seed and a patroller."""
+    """Measure LBA of each method at each number of sessions; a row is a seed and a patroller."""
     patrol = instance(number)
     view = patrol.visibility(observability)
     score = jax.jit(jax.vmap(partial(evaluate, patrol.mdp, jnp.asarray(patrol.weights))))

@@ -107,7 +107,7 @@ def _timed(patrol: Patrol, learner: Learner, streams: Demonstration) -> tuple[Ou
 def noise_methods(
     streams: Streams, patrol: Patrol
 ) -> dict[str, tuple[Callable[..., Learner], Demonstration]]:
-    """Learners (given options) and what each sees."""
+    """Return learners (given options) and the input of each."""
     mdp = patrol.mdp
     shared = noise_learners(patrol, streams.sensor)
     return {
@@ -194,7 +194,7 @@ def noise_study(
 
 
 def view_study(file: _File, *, replications: int, sessions: int, iterations: int) -> None:
-    """GAIL and LME-I2RL at three degrees of observability."""
+    """Run GAIL and LME-I2RL at three degrees of observability."""
     patrol = instance(2)
     mdp = patrol.mdp
     options: dict[str, Any] = {"iterations": iterations, "updates": 5, "horizon": 8, **GAIL_OPTIONS}

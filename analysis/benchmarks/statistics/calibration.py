@@ -157,7 +157,7 @@ def _replicate(
 
 
 def uniformity(ranks: Ranks, bins: int = 16) -> list[Uniformity]:
-    """Chi-square test of each quantity; raises ``ValueError`` unless ``bins`` divides ``draws + 1``."""
+    """Test each quantity by chi-square; raises ``ValueError`` unless ``bins`` divides ``draws + 1``."""
     if (ranks.draws + 1) % bins:
         raise ValueError(f"{bins} bins cannot share {ranks.draws + 1} ranks evenly")
     tests = []

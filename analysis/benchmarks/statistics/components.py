@@ -1,6 +1,6 @@
 """Several behaviours of a task: online against batch, a late component, hidden steps, experts who err.
 
-``python -m i2rl.analysis.benchmarks.statistics.n_components`` measures MME-MTIRL on onion sorting (26 states,
+``python -m i2rl.analysis.benchmarks.statistics.components`` measures MME-MTIRL on onion sorting (26 states,
 ``D = 4``):
 
 - *online*: trajectories arrive in sessions; value difference and cumulative seconds against re-running the
@@ -80,7 +80,7 @@ def timed(function: Callable[..., Any], *arguments: Any) -> tuple[float, Any]:
 def online_against_batch(
     sorting: Sorting, tasks: int, n: int, size: int, seeds: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """Value differences at equal data, and cumulative seconds."""
+    """Measure value differences at equal data, and cumulative seconds."""
     online, batch = mme_mtirl(sorting.mdp), batch_mme_mtirl(sorting.mdp)
     records = []
     for seed in (seeds[0], *seeds):  # the first is done twice: it compiles
@@ -110,7 +110,7 @@ def online_against_batch(
 
 
 def late_component(sorting: Sorting, sessions: int, size: int, seeds: Sequence[int]) -> list[dict[str, Any]]:
-    """Two behaviours for two thirds of the sessions, three in the last third."""
+    """Learn two behaviours for two thirds of the sessions, three in the last third."""
     learner, records = mme_mtirl(sorting.mdp), []
     early = 2 * sessions // 3
     for seed in seeds:
@@ -159,7 +159,7 @@ def hide(key: jax.Array, demonstration: Demonstration, share: float) -> Demonstr
 def hidden_steps(
     sorting: Sorting, tasks: int, n: int, share: float, seeds: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """Trajectories that were seen in part."""
+    """Learn from partly hidden trajectories."""
     sensor = Visibility(np.full(sorting.mdp.n_states, 1 - share))
     batch, records = batch_mme_mtirl(sorting.mdp, sensor), []
     for seed in seeds:
@@ -185,7 +185,7 @@ def hidden_steps(
 def soft_experts(
     sorting: Sorting, sharpness: float, tasks: int, n: int, temperature: float, seeds: Sequence[int]
 ) -> list[dict[str, Any]]:
-    """Experts who err as the model says they do."""
+    """Learn from experts who obey the soft model."""
     batch, records = batch_mme_mtirl(sorting.mdp, temperature=temperature), []
     labels: Int[np.ndarray, " n"] = np.repeat(np.arange(tasks), n // tasks)
     for seed in seeds:

@@ -55,13 +55,14 @@ def random_setting(seed: int = 0, n_states: int = 12, n_actions: int = 3, n_feat
 
 
 def patrol_setting(length: int) -> Setting:
-    """Patrol 2 at 30 % observability."""
+    """Build the setting of patrol 2 at 30 % observability."""
     patrol = instance(2)
     return Setting("patrol 2", patrol.mdp, jnp.asarray(patrol.weights), patrol.visibility(30), length)
 
 
 def sample_sizes(setting: Setting, confidence: float = 0.8) -> pd.DataFrame:
-    """Trajectories for the log-likelihood errors of Table 7.1(a), by Theorem 2 and by the tighter bounds.
+    """Compute trajectories for the log-likelihood errors of Table 7.1(a), by Theorem 2 and by the tighter
+    bounds.
 
     ``exact_completion``: Theorem 1's number for the same error in nats and the same confidence, as exact
     completion needs no ``epsilon_s`` and ``delta_s``. ``observed``: with the features' spread observed too.

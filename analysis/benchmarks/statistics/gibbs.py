@@ -39,11 +39,11 @@ class Torque(NamedTuple):
     slope: Float[Array, "1 2"]
 
     def moments(self, s: Float[Array, "... 2"]) -> tuple[Array, Array]:
-        """Mean and covariance of the action."""
+        """Compute the mean and covariance of the action."""
         return s @ self.slope.T + 0.2, jnp.full((*s.shape[:-1], 1, 1), POLICY_VARIANCE)
 
     def log_prob(self, s: Float[Array, "... 2"], a: Float[Array, "... 1"]) -> Float[Array, "..."]:
-        """Log-density of actions, in nats."""
+        """Compute the log-density of actions, in nats."""
         return log_normal(a - self.moments(s)[0], POLICY_VARIANCE * jnp.eye(1))
 
 
@@ -145,7 +145,7 @@ def by_particles(key: Array, process: float, variance: float, reported: Recordin
 def by_gibbs(
     key: Array, truth: GaussianTruth, sensor: GaussianSensor, reported: Recording, refreshes: int
 ) -> tuple[Moments, Any]:
-    """Moments over the chains and all but the first third of the refreshes; and the chains."""
+    """Compute moments over the chains and the last two thirds of the refreshes; return the chains, too."""
     gibbs = GaussianGibbs(truth, sweeps=2)
     chain, kept = gibbs.init(reported, sensor), []
     for i in range(refreshes):
@@ -157,7 +157,7 @@ def by_gibbs(
 
 
 def compare(process: float, variance: float, seed: int, options: Any) -> dict[str, float]:
-    """Largest differences from the referee at one setting, of one trajectory."""
+    """Compute the largest differences from the referee at one setting, of one trajectory."""
     sensor = GaussianSensor(variance, variance)
     reported = problem(seed, process, sensor, options.steps)
     key = jax.random.key(seed)

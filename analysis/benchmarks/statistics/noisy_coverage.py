@@ -127,7 +127,8 @@ class CoverageStudy(NamedTuple):
 
 
 def corridor(reliability_prior: dist.Distribution | None = None) -> NoisySetting:
-    """Four cells, two headings and three actions: go on, turn round, wait; one in ten fails.
+    """Build a corridor of four cells, two headings and three actions: go on, turn round, wait; one in ten
+    fails.
 
     Ten trajectories of five steps; three weights, ``Normal(0, 1.5)``, and three predicates.
     """
@@ -257,7 +258,7 @@ _sampled = jax.jit(noisy_chain, static_argnames=("warmup", "draws"))
 def _densities(
     weights: Float[Array, "D K"], reliabilities: Float[Array, "D J"], problem: NoisyProblem
 ) -> tuple[Float[Array, " D"], Float[Array, " D"]]:
-    """Log-likelihood, and log-density of parameters and data together, at every point."""
+    """Compute the log-likelihood, and the log-density of parameters and data together, at every point."""
 
     def one(draw: tuple) -> tuple:
         sensor = FeatureNoise(problem.predicates, draw[1], problem.reportable)
@@ -326,7 +327,7 @@ def judge(quantities: tuple[str, ...], replications: Iterable[Run], kept: int = 
 
 
 def coverage_interval(covered: Bool[np.ndarray, " R"]) -> tuple[float, float]:
-    """Clopper and Pearson's 95 % interval for the probability behind a share of replications."""
+    """Compute Clopper and Pearson's 95 % interval for the probability behind a share of replications."""
     interval = stats.binomtest(int(covered.sum()), len(covered)).proportion_ci(0.95, "exact")
     return float(interval.low), float(interval.high)
 

@@ -31,14 +31,18 @@ _WHOLE = 25
 
 
 def binary_noise(n_states: int, n_actions: int, reliability: float) -> FeatureNoise:
-    """One predicate for each bit of a pair's index, so that each combination of them is one pair."""
+    """Build noise on one predicate for each bit of a pair's index, so that each combination of them is one
+    pair.
+    """
     size = n_states * n_actions
     bits = np.arange(size) >> np.arange(int(np.log2(size)))[:, None] & 1
     return FeatureNoise(bits.reshape(-1, n_states, n_actions), np.full(len(bits), reliability))
 
 
 def shift_setting(reliability: float, length: int) -> Setting:
-    """Two bits of memory, into which actions are shifted; action 1 and two of them in memory are rewarded."""
+    """Build a shift register of two bits, filled by actions; action 1 and two of them in the register are
+    rewarded.
+    """
     state, action = np.indices((4, 2))
     successors = np.stack([(2 * state + action) % 4, (2 * state + 1 - action) % 4], axis=2)
     features = np.stack([action == 1, state == 3], axis=2).astype(float)
@@ -54,7 +58,7 @@ def shift_setting(reliability: float, length: int) -> Setting:
 
 
 def random_reported_setting(reliability: float, length: int, seed: int = 0) -> Setting:
-    """Eight states, two actions and four features at random."""
+    """Draw a process of eight states, two actions and four features."""
     rng, shape = np.random.default_rng(seed), (8, 2)
     mdp = TabularMDP.from_successors(
         np.argsort(rng.random((*shape, 8)), axis=2)[:, :, :3],
@@ -68,14 +72,14 @@ def random_reported_setting(reliability: float, length: int, seed: int = 0) -> S
 
 
 def sorting_setting() -> Setting:
-    """Onion sorting from all states by a soft expert of the true weights, scaled to a largest of one."""
+    """Build onion sorting from all states by a soft expert of the true weights, the largest one."""
     task = noisy_sorting()
     weights = jnp.asarray(task.weights / task.weights.max())
     return Setting("sorting", task.starting("all"), weights, feature_noise(task), 3)
 
 
 def rare_setting() -> Setting:
-    """One step in one of two states, the second with probability 0.01."""
+    """Build a process of one step in one of two states, the second with probability 0.01."""
     mdp = TabularMDP.from_successors(
         np.zeros((2, 1, 1), int),
         np.ones((2, 1, 1)),

@@ -83,14 +83,14 @@ class Setting(NamedTuple):
 
 
 def streams(codes: np.ndarray) -> Demonstration:
-    """Streams ``[R, T, n, L]`` from their codes ``[R, T, n, L, 3]``."""
+    """Make streams ``[R, T, n, L]`` from their codes ``[R, T, n, L, 3]``."""
     return Demonstration.from_codes(codes)
 
 
 def _walks(
     key: Array, patrol: Patrol, log_policy: Array, sensor: AnySensor, shape: tuple[int, int]
 ) -> np.ndarray:
-    """``shape[0]`` trajectories of ``shape[1]`` steps as codes."""
+    """Simulate ``shape[0]`` trajectories of ``shape[1]`` steps as codes."""
 
     @jax.jit
     def one(key: Array) -> Array:

@@ -67,7 +67,7 @@ def shown(expert: str, seed: int, patrol: Patrol, fragments: int) -> Demonstrati
 
 
 def judge(posteriors: Mapping[str, az.InferenceData]) -> dict[str, Any]:
-    """Differences to the six features, their standard errors, and how reliable they are."""
+    """Compute differences to the six features, their standard errors, and their reliability."""
     main = compare_posteriors({name: posteriors[name] for name in RIVALS})
     record: dict[str, Any] = {"picked": main.best}
     for name in posteriors:

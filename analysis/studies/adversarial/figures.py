@@ -50,7 +50,7 @@ def _style(theme: Theme, method: str) -> dict:
 
 
 def learning_plot(results: AdversarialResults, theme: Theme) -> Figure:
-    """LBA, return, or both against the pairs seen: a line a method, with the interval over replications."""
+    """Draw LBA, return, or both against the pairs seen: a line a method, with its interval."""
     names = {"accuracy": "learned behaviour accuracy (LBA)", "returns": "return"}
     shown = [m for m in names if any(getattr(r, m) is not None for r in results.methods.values())]
     figure = new_figure(theme, 4.7 * len(shown) + 0.5 if len(shown) > 1 else 7.6, 4.6)
@@ -214,7 +214,7 @@ def recovery_plot(results: Sequence[AdversarialResults], theme: Theme) -> Figure
 
 
 def scatter_plot(scatters: Mapping[str, RewardScatter], theme: Theme, title: str = "") -> Figure:
-    """Learned against true rewards, a panel a method: steps as dots, whole trajectories as marks.
+    """Draw learned against true rewards, a panel a method: steps as dots, whole trajectories as marks.
 
     The scale of a learned reward is free, so each panel has its own.
     """
@@ -365,7 +365,7 @@ def cells_plot(
     high: Sequence[float],
     theme: Theme,
 ) -> Figure:
-    """LBA in every cell of mountain car's states: the places where a policy agrees with the expert."""
+    """Draw LBA in every cell of mountain car's states: the places where a policy agrees with the expert."""
     n = len(cells)
     figure = new_figure(theme, max(2.9 * n + 1.2, 6.0), 3.7)
     panels = np.atleast_1d(figure.subplots(1, n, sharey=True))
@@ -438,7 +438,7 @@ def frames_plot(strips: Sequence[FrameStrip], theme: Theme, title: str = "") -> 
 
 
 def _outlines(strip: FrameStrip, points: int = 12) -> Float[np.ndarray, "F G points 2"]:
-    """Outline of every limb: two half circles about its ends."""
+    """Compute the outline of every limb: two half circles about its ends."""
     ends = strip.capsules[..., :4].reshape(*strip.capsules.shape[:-1], 2, 2)
     along = ends[..., 1, :] - ends[..., 0, :]
     angle = np.arctan2(along[..., 1], along[..., 0])[..., None]

@@ -65,7 +65,7 @@ _NONE = "-"
 
 
 def learning_table(results: AdversarialResults) -> Table:
-    """LBA and return after the last sessions, beside Table 7.3 where it has the domain."""
+    """Tabulate LBA and return after the last sessions, beside Table 7.3 where it has the domain."""
     printed = TABLE_7_3.get(results.domain)
     measures = [m for m in ("accuracy", "returns") if any(_has(r, m) for r in results.methods.values())]
     heads = {"accuracy": "LBA, %", "returns": "return"}
@@ -163,7 +163,7 @@ def correlation_table(results: AdversarialResults) -> Table:
 
 
 def ile_table(results: AdversarialResults) -> Table:
-    """Empirical ILE in both forms; of the onion task beside Table 7.5, which is of no other."""
+    """Tabulate empirical ILE in both forms; that of the onion task beside Table 7.5."""
     published = TABLE_7_5 if results.domain == "onion" else {}
     rows = []
     for name, result in results.methods.items():
@@ -189,7 +189,7 @@ def ile_table(results: AdversarialResults) -> Table:
 
 
 def breach_table(results: AdversarialResults) -> Table:
-    """Success of breaches of the patrol."""
+    """Tabulate successes of breaches of the patrol."""
     rows = []
     if results.expert_breaches is not None:
         rows.append((EXPERT, _NONE, f"{100 * results.expert_breaches:.1f}", _NONE))
@@ -207,7 +207,7 @@ def breach_table(results: AdversarialResults) -> Table:
 
 
 def pace_table(results: AdversarialResults) -> Table:
-    """Seconds a session."""
+    """Tabulate seconds a session."""
     rows = [(n, f"{r.seconds:.2f}") for n, r in results.methods.items() if r.seconds is not None]
     return Table(("method", "seconds a session"), rows, f"Median once compiled, on {results.machine}.")
 

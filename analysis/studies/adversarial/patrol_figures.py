@@ -51,7 +51,9 @@ _MEMORY = {
 
 
 def noise_curves(results: Results, theme: Theme, level: float = 0.05) -> Figure:
-    """LBA against pairs seen, without and with memory of earlier sessions; LME-I2RL in both for reference."""
+    """Draw LBA against pairs seen, without and with memory of earlier sessions; LME-I2RL in both for
+    reference.
+    """
     figure = new_figure(theme, 9.6, 4.8)
     figure.get_layout_engine().set(wspace=0.05)  # type: ignore[union-attr, call-arg]
     panels = figure.subplots(1, 2, sharey=True)
@@ -166,7 +168,8 @@ def _last(one: Mapping[str, Any]) -> Float[np.ndarray, " R"]:
 
 
 def view_curves(results: Results, theme: Theme, gail_memory: float = 0.0) -> Figure:
-    """LBA against trajectories at each observability, and what hiding costs relative to a full view.
+    """Draw LBA against trajectories at each observability, and the cost of hidden steps relative to a full
+    view.
 
     The right panels are those of Figure 7.4(c): ``(LBA_full - LBA_hidden) / LBA_full``.
     """

@@ -196,7 +196,7 @@ class AdversarialResults(NamedTuple):
         )
 
     def recovery(self, method: str = ROBUST) -> Recovery | None:
-        """Share of what noise cost that a method recovers, None without all three methods."""
+        """Compute a method's recovery of the loss to noise; None without all three methods."""
         replications = [self.late(name, self.measure) for name in (CLEAN, NOISY, method)]
         if any(x is None for x in replications):
             return None
@@ -211,7 +211,8 @@ def reward_scatter(
     whose: Int[np.ndarray, " n"],
     key: Array,
 ) -> RewardScatter:
-    """Rewards of held-out episodes (:func:`~i2rl.domains.robots.simulation.graded_mix`), some steps drawn.
+    """Collect rewards of held-out episodes (:func:`~i2rl.domains.robots.simulation.graded_mix`), some steps
+    drawn.
 
     Raises as :func:`~i2rl.analysis.judging.returns.reward_correlation` does.
     """
@@ -252,7 +253,7 @@ def frame_strip(
     frames: int = 10,
     seconds: float = 1.5,
 ) -> FrameStrip:
-    """Moments evenly spread over the first ``seconds`` of an episode.
+    """Return moments evenly spread over the first ``seconds`` of an episode.
 
     Observations leave the horizontal position out; it is the sum of their velocities.
     """

@@ -144,7 +144,7 @@ def _gathered(method: str, plan: Plan) -> int:
 
 
 def run(name: str, method: str, seed: int, plan: Plan) -> Outcome:
-    """One seed of one method."""
+    """Run one replication of one method."""
     of = case(name, plan)
     k_learner, k_noise, k_judge = jax.random.split(jax.random.key(seed), 3)
     online = learner(name, method, plan)
@@ -197,7 +197,9 @@ def _session(whole: Recording, session: int, seed: int, trajectories: int) -> Re
 
 @lru_cache(maxsize=4)
 def _held_out(name: str, plan: Plan) -> tuple[Trajectories, np.ndarray]:
-    """Episodes of the expert, disturbed to several degrees; the same for all methods and seeds."""
+    """Simulate episodes of the expert, disturbed to several degrees; the same for all methods and
+    replications.
+    """
     of = case(name, plan)
     policies = [Perturbed(of.expert, share) for share in LEVELS]
     return graded_mix(of.level, policies, jax.random.key(20), 20, of.held_out)
@@ -214,7 +216,7 @@ def _scatter(name: str, plan: Plan, network: Any, seed: int) -> RewardScatter:
 
 
 def _error(of: Case, network: Any, policy: Any, key: Array) -> EmpiricalILE:
-    """By the learned reward: the demonstration before noise, and the learner's behaviour."""
+    """Compute ILE under the learned reward: the demonstration before noise, and the learner's behaviour."""
     shown = of.demonstrations
     own = simulate(of.level, policy, key, 10, shown.live.shape[1], deterministic=True)
     return bounded_ile(
@@ -316,7 +318,7 @@ def _frames(name: str, shown: Mapping[str, Outcome]) -> tuple[FrameStrip, ...]:
 
 
 def _settings(plan: Plan, repeats: Mapping[str, Sequence[Outcome]]) -> dict[str, Any]:
-    """For the file: the plan, the budget of each method, and the learned sensor."""
+    """Return the file's settings: the plan, the budget of each method, and the learned sensor."""
     told = {**{k: v for k, v in plan._asdict().items() if k != "settings"}, **dict(plan.settings)}
     told["environment steps"] = {m: int(outcomes[0].steps[-1]) for m, outcomes in repeats.items()}
     if LEARNED in repeats:

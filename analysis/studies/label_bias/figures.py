@@ -83,7 +83,7 @@ def draw_world(study: LabelBiasStudy, theme: Theme) -> Figure:
 
 
 def draw_scatter(study: LabelBiasStudy, theme: Theme) -> Figure:
-    """Log-likelihood against total reward under both methods, side by side."""
+    """Draw log-likelihood against total reward under both methods, side by side."""
     from .study import tell_p
 
     figure = new_figure(theme, 9.0, 3.9)
@@ -201,7 +201,7 @@ def draw_settings(study: LabelBiasStudy, theme: Theme) -> Figure:
 
 
 def draw_sweep(study: LabelBiasStudy, theme: Theme) -> Figure:
-    """BIRL's correlation against the inverse temperature of experts and of the likelihood alike."""
+    """Draw BIRL's correlation against the inverse temperature of experts and of the likelihood alike."""
     from .study import PRINTED_RHO, quantiles
 
     figure = new_figure(theme, 8.2, 4.4)

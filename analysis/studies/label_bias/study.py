@@ -232,7 +232,7 @@ def label_bias_study(
 
 
 def correlation(x: Float[np.ndarray, " n"], y: Float[np.ndarray, " n"]) -> Correlation:
-    """Pearson's correlation of two samples. Raises ``ValueError`` if one of them is constant."""
+    """Compute Pearson's correlation of two samples. Raises ``ValueError`` if one of them is constant."""
     if min(_spread(x), _spread(y)) == 0:
         raise ValueError("one of the two samples is constant: there is no correlation to speak of")
     result = stats.pearsonr(x, y)
@@ -249,7 +249,7 @@ def _spread(x: np.ndarray) -> float:
 
 
 def significance(rho: float, n: int) -> float:
-    """Two-sided p-value of a Pearson correlation ``rho`` of ``n`` pairs."""
+    """Compute the two-sided p-value of a Pearson correlation ``rho`` of ``n`` pairs."""
     return float(2 * stats.t.sf(abs(rho) * np.sqrt((n - 2) / (1 - rho**2)), n - 2))
 
 
@@ -289,7 +289,7 @@ def _stacked(mdps: Sequence[TabularMDP]) -> TabularMDP:
 
 
 def _bare(mdp: TabularMDP) -> TabularMDP:
-    """Without what differs in kind from world to world and is not used here: one program serves them all."""
+    """Remove unused parts that differ in kind from world to world, so that one program serves them all."""
     return replace(mdp.without_inflow(), labels=Labels())
 
 

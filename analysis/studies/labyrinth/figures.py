@@ -101,7 +101,7 @@ def _method_styles(theme: Theme, result: LabyrinthStudy) -> dict[str, dict[str, 
 
 
 def _spread(heights: Float[np.ndarray, " m"], gap: float) -> Float[np.ndarray, " m"]:
-    """Increasing heights moved apart to at least ``gap``, as little as a few sweeps can."""
+    """Move increasing heights apart to at least ``gap``, as little as a few iterations can."""
     placed = np.array(heights, float)
     for _ in range(200):
         short = gap - np.diff(placed)

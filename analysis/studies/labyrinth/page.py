@@ -75,7 +75,7 @@ def _estimates(result: LabyrinthStudy, view: ViewStudy) -> Estimates | None:
 
 
 def tables(result: LabyrinthStudy) -> list[Table]:
-    """One table a view, methods in order of their score, intervals 95 % over bouts."""
+    """Tabulate each view, methods in order of their score, intervals 95 % over bouts."""
     made = []
     for view in result.views:
         outside = view.decisions_out_of_view.sum()

@@ -220,7 +220,7 @@ def predict_with_learner(
     name: str = LEARNER,
     on_bout: Callable[[int, float], None] | None = None,
 ) -> tuple[Prediction, Learned]:
-    """One session of LME-I2RL a bout; each is predicted whole, also where the learner cannot see.
+    """Run LME-I2RL, a session a bout; predict each bout whole, also its hidden steps.
 
     The first bout is predicted from the prior's mode, zero weights.
     """
@@ -318,7 +318,7 @@ def _log_policy(
 
 
 def _code_lengths(log_policy: ArrayLike, demonstration: Demonstration) -> Float[np.ndarray, "n L"]:
-    """Bits that each decision costs under a policy ``[S, A]``; zero on padding."""
+    """Compute the bits of each decision under a policy ``[S, A]``; zero on padding."""
     lengths = -np.asarray(log_policy)[demonstration.state, demonstration.action] / np.log(2)
     return np.where(demonstration.kind == PAD, 0.0, lengths)
 
@@ -347,7 +347,7 @@ def _prediction(
 def bits_per_decision(
     bits: Float[np.ndarray, " n"], decisions: Int[np.ndarray, " n"], draws: int = 2000
 ) -> Interval:
-    """Total bits over total decisions, with a bootstrap interval over bouts.
+    """Compute total bits over total decisions, with a bootstrap interval over bouts.
 
     ``bits`` may be a difference of two methods' bits: the interval is then that of the paired difference.
     The same bouts are drawn at every call.

@@ -52,7 +52,7 @@ _TUNING = 7919
 
 
 def methods_table(mdp: TabularMDP, demonstration: Demonstration | None = None) -> pandas.DataFrame:
-    """Table 8.1 as it stands in this library: each method's reward and memory.
+    """Tabulate Table 8.1 for this library: each method's reward and memory.
 
     One row per method: ``reward`` and ``statistic`` name the parts, ``reward numbers`` and ``statistic
     numbers`` count their floats in the learner's own state on ``mdp``. Random keys, session counters and warm
@@ -262,7 +262,7 @@ def _accuracies(
     streams: Sequence[tuple[Array, Demonstration]],
     points: Int[np.ndarray, " points"],
 ) -> tuple[Float[np.ndarray, "streams points"], Float[np.ndarray, "streams K"]]:
-    """Accuracy after so many pairs, and the weights in the end."""
+    """Compute accuracy after so many pairs, and the weights in the end."""
     learner = entry.learner(learning_rate)
     optimal = optimal_actions(patrol.mdp, jnp.asarray(patrol.weights))
     rows, final = [], []
@@ -358,7 +358,7 @@ def summary(study: MethodsStudy) -> dict[str, Any]:
 
 
 def _estimates(study: MethodsStudy) -> Estimates | None:
-    """Weights of the last method in the first stream, if they are of the process's features."""
+    """Return weights of the last method in the first stream, if they are of the process's features."""
     mdp, weights = study.patrol.mdp, study.curves[-1].weights[0]
     if not study.curves[-1].name.startswith(("LME", "ME")):
         return None
@@ -367,7 +367,7 @@ def _estimates(study: MethodsStudy) -> Estimates | None:
 
 
 def _pairs_to(study: MethodsStudy, curve: MethodCurve, level: float) -> int | None:
-    """Pairs from which on the median accuracy stays at ``level``; None if it does not."""
+    """Find the pairs from which on the median accuracy stays at ``level``; None if it does not."""
     enough = np.median(curve.accuracy, axis=0) >= level
     stays = np.logical_and.accumulate(enough[::-1])[::-1]
     return int(study.points[np.argmax(stays)]) if stays.any() else None

@@ -81,7 +81,8 @@ def sensor_posterior(
     draws: int = 100,
     warmup: int = 100,
 ) -> SensorPosterior:
-    """Joint posterior over reward and reliabilities, each draw turned into agreement among ``pairs``.
+    """Sample the joint posterior over reward and reliabilities, each draw turned into agreement among
+    ``pairs``.
 
     Reliabilities are parameters and are no frequencies, so only agreement can be compared with the truth,
     which is no :class:`FeatureNoise`.
@@ -205,7 +206,7 @@ def sorted_belts(
 
 
 def per_belt(row: SortingRow) -> tuple[float, ...]:
-    """Mean TP, FP, TN and FN of a belt, from sums over any number of belts."""
+    """Compute the mean TP, FP, TN and FN of a belt, from sums over any number of belts."""
     line = Line()
     onions = sum(row.tally.means)
     return tuple(mean * line.sets * line.onions / onions for mean in row.tally.means)

@@ -99,7 +99,7 @@ def _legend_above(panel: Axes, theme: Theme, title: str) -> None:
 
 
 def _mean_of(replications: int, interval: str = "band") -> str:
-    """Small print of a figure of means."""
+    """Write the small print of a figure of means."""
     return (
         "line: one replication"
         if replications == 1
@@ -153,7 +153,9 @@ def divergence_plot(study: NoisyStudy, theme: Theme) -> Figure:
 
 
 def accuracy_plot(study: NoisyStudy, theme: Theme) -> Figure:
-    """LBA against sessions: a panel for each set of states, or one in full view and one through a keyhole."""
+    """Draw LBA against sessions: a panel for each set of states, or one in full view and one through a
+    keyhole.
+    """
     names = [m for m in (PLAIN, AVERAGED, STEPWISE, FAIR, KNOWN, CLEAR) if m in study.results]
     everywhere = study.states.all()
     titles = (
@@ -201,7 +203,7 @@ def accuracy_plot(study: NoisyStudy, theme: Theme) -> Figure:
 
 
 def sensor_plot(posterior: SensorPosterior, theme: Theme) -> Figure:
-    """Each agreement probability: its posterior (median, middle 90 %), RIMEO's estimate, and the truth."""
+    """Draw agreement probabilities: posterior (median, middle 90 %), RIMEO's estimate, and truth."""
     band = quantile_band(posterior.draws, 0.9)
     n = len(posterior.names)
     figure = new_figure(theme, 7.4, 1.9 + 0.36 * n)

@@ -150,7 +150,7 @@ def _with_interval(
 
 
 def sensor_table(study: NoisyStudy) -> Table:
-    """Divergence of every estimate early and in the end, and as a share of the control."""
+    """Tabulate the divergence of every estimate early and in the end, and as a share of the control."""
     rows = [("constant one half", f"{study.control:.4f}", "1", "", f"{study.control:.4f}", "1", "")]
     early, late = min(EARLY, study.sessions), study.sessions
     for name, result in study.results.items():
@@ -231,7 +231,7 @@ def doubt_table(study: NoisyStudy) -> Table:
 
 
 def behaviour_table(study: NoisyStudy) -> Table:
-    """LBA of every method after the last session."""
+    """Tabulate LBA of every method after the last session."""
     kept = [0] if study.states.all() else [0, 1, 2]
     headings = [f"{STATES[i]} states, % ({study.states[i].sum()})" for i in kept]
     rows = [
@@ -249,7 +249,7 @@ def behaviour_table(study: NoisyStudy) -> Table:
 
 
 def hidden_table(study: NoisyStudy) -> Table:
-    """LBA where most of the patrol is out of view."""
+    """Tabulate LBA with most of the patrol out of view."""
     assert study.hidden is not None
     clear, noisy = (study.hidden[name].accuracy[..., 0] for name in (HIDDEN, BOTH))
     early = min(EARLY, study.sessions)
@@ -269,7 +269,7 @@ def hidden_table(study: NoisyStudy) -> Table:
 
 
 def pace_table(study: NoisyStudy) -> Table:
-    """Milliseconds a session, once compiled."""
+    """Tabulate milliseconds a session, once compiled."""
     base = study.seconds.get(FAIR, math.nan)
     rows = [
         (name, f"{1000 * seconds:.2f}", "-" if math.isnan(base) else f"{seconds / base:.2f}")
@@ -285,7 +285,7 @@ def pace_table(study: NoisyStudy) -> Table:
 
 
 def belts_table(study: NoisyStudy) -> Table:
-    """Precision and recall beside the table of Figure 7.9."""
+    """Tabulate precision and recall beside the table of Figure 7.9."""
     assert study.belts is not None
     return Table(
         HEADINGS,

@@ -73,7 +73,7 @@ _SURE = 1e-12
 def divergence(
     truth: Float[np.ndarray, " J"], estimate: Float[np.ndarray, "... J"]
 ) -> Float[np.ndarray, "..."]:
-    """Mean over predicates of ``KL(Bernoulli(truth) || Bernoulli(estimate))``, in nats."""
+    """Compute the mean over predicates of ``KL(Bernoulli(truth) || Bernoulli(estimate))``, in nats."""
     p, q = np.asarray(truth, float), np.clip(np.asarray(estimate, float), _SURE, 1 - _SURE)
     with np.errstate(divide="ignore", invalid="ignore"):
         right = np.where(p > 0, p * np.log(p / q), 0.0)
@@ -129,7 +129,7 @@ def draw_streams(
     noise: AnySensor | None = None,
     visibility: Visibility | None = None,
 ) -> Streams:
-    """Independent streams with calibrated scores, all trajectories drawn in one go.
+    """Simulate independent streams with calibrated scores, all trajectories drawn in one go.
 
     Raises ``ValueError`` as :func:`demonstrate_noisy` does.
     """
@@ -264,7 +264,7 @@ class _Entry(NamedTuple):
 
 
 def _plain_learner(mdp: TabularMDP, sensor: AnySensor) -> Learner:
-    """Maximum-entropy IRL whose settings are those of RIMEO, the sensor being known."""
+    """Build maximum-entropy IRL with RIMEO's settings and a known sensor."""
     return lme_i2rl(mdp, sensor, slack=0.0, ridge=DEFAULT_RIDGE, iterations=DEFAULT_ITERATIONS)
 
 
@@ -349,7 +349,7 @@ def _judged_states(task: NoisyTask) -> Bool[np.ndarray, "3 S"]:
 
 
 def _learned(key: Array, learner: Learner, streams: Streams, entry: _Entry) -> tuple:
-    """Weights and agreement after every session, and the final states."""
+    """Return weights and agreement after every session, and the final states."""
     replications = len(streams.seen.kind)
     if learner.session is None:
         kept = [
@@ -528,7 +528,7 @@ def _seconds(methods: Sequence[str], task: NoisyTask, streams: Streams) -> dict[
 def _hidden(
     key: Array, judge: _Judge, replications: int, sessions: int, starts: Starts
 ) -> dict[str, MethodResult]:
-    """Most states out of view: without noise, and with noise that is learned; the same paths are walked."""
+    """Run with most states out of view, without noise and with learned noise; the walks are the same."""
     view = instance(2).visibility(OBSERVABILITY)
     draw, learn = jax.random.split(key)
     # Until something is seen there is no agreement to judge.

@@ -296,7 +296,7 @@ def _not_learned(weights: np.ndarray, demonstrations: Sequence[Demonstration]) -
 
 
 def _interpolated_sum(points: np.ndarray, seconds: np.ndarray) -> np.ndarray:
-    """Cumulative cost of running batch again after every session, between the points it was timed at."""
+    """Interpolate the cumulative cost of a batch run after every session, between its timed points."""
     return np.cumsum(np.interp(np.arange(1, points[-1] + 1), points, seconds))
 
 
@@ -347,7 +347,9 @@ def _evaluated(
 
 
 def _stretch(key: jax.Array, patrol: Patrol, observability: int, weights: np.ndarray) -> Stretch:
-    """One round of a patroller outside the training data, and its posterior under the learned weights."""
+    """Simulate one round of a patroller outside the training data, and its posterior under the learned
+    weights.
+    """
     policy = jnp.log(jnp.asarray(patrol.expert_policy()))[None]
     first, walk, look = jax.random.split(key, 3)
     # Started in view, so that the first hidden gap lies between two sightings.
@@ -533,7 +535,7 @@ def _lost(error: float) -> str:
 
 
 def _share_as_good(study: Study) -> float:
-    """Share of random weights whose LBA is that of the first method, or more."""
+    """Compute the share of random weights whose LBA is that of the first method, or more."""
     return float(np.mean(study.chance >= np.median(study.methods[0].accuracy[:, -1]) - 1e-9))
 
 

@@ -72,15 +72,14 @@ def embed(features: Float[np.ndarray, "n K"]) -> Embedding:
 
 
 def feature_counts(mdp: TabularMDP, demonstration: Demonstration) -> Float[np.ndarray, "n K"]:
-    """Undiscounted sums of features over the steps of fully seen trajectories."""
+    """Compute undiscounted sums of features over the steps of fully seen trajectories."""
     real = np.asarray(demonstration.kind) != PAD
     per_step = np.asarray(mdp.features)[demonstration.state, demonstration.action]
     return np.sum(np.where(real[..., None], per_step, 0.0), axis=1)
 
 
 def clusters_plot(study: SortingStudy, theme: Theme) -> Figure:
-    """Draw the first replication's trajectories on two principal components of feature counts, a panel a
-    method.
+    """Draw first replication's trajectories on two principal components of feature counts, a panel a method.
 
     The marker is the true component; the colour the component found.
     """
@@ -468,7 +467,9 @@ def components_plot(study: SortingStudy, theme: Theme) -> Figure:
 
 
 def time_plot(study: SortingStudy, theme: Theme) -> Figure:
-    """Seconds of learning against trajectories; the online learner's are those of all its sessions so far."""
+    """Draw seconds of learning against trajectories; the online learner's are those of all its sessions so
+    far.
+    """
     figure = new_figure(theme, 8.6, 4.8)
     axes = figure.subplots()
     for i, result in enumerate(study.results):

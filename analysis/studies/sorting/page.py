@@ -203,7 +203,7 @@ def _scope(study: SortingStudy) -> str:
 
 
 def _sorting_tables(study: SortingStudy) -> list[Table]:
-    """Table 7.2, a table a behaviour."""
+    """Tabulate Table 7.2, a table a behaviour."""
     return [
         Table(HEADINGS, cells(study.table, behaviour), f"Table 7.2, {behaviour}. {caption(study.table)}")
         for behaviour in behaviours(study.table)

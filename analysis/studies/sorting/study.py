@@ -263,7 +263,7 @@ def sorting_study(
 
 
 def counts_of(tasks: int, text: str | None) -> tuple[int, ...] | None:
-    """Numbers of trajectories from ``8,16,32``, or ``all`` of :data:`GRID`; None stays None.
+    """Parse numbers of trajectories from ``8,16,32``, or ``all`` of :data:`GRID`; None stays None.
 
     Raises ``ValueError`` for anything else.
     """
@@ -319,7 +319,7 @@ def _check(
 
 
 def _stream(key: Array, sorting: Sorting, tasks: int, borders: Int[np.ndarray, " T"], steps: int) -> _Stream:
-    """Trajectories in turn, mixed up between one border and the next."""
+    """Simulate trajectories in turn, mixed up between one border and the next."""
     walk, order, learn = jax.random.split(key, 3)
     most = int(borders[-1])
     counts = [len(range(b, most, tasks)) for b in range(tasks)]
@@ -438,7 +438,7 @@ def _judged(
 
 
 def _measures(columns: Sequence[Sequence[tuple[float, ...]]]) -> Measures:
-    """From rows of numbers by column and run."""
+    """Collect measures from rows of numbers by column and replication."""
     evd, n_components, accuracy, rand, seconds = np.array(columns, float).transpose(2, 1, 0)
     return Measures(evd, n_components.astype(int), accuracy, rand, seconds)
 

@@ -49,11 +49,11 @@ class Counts(NamedTuple):
     false_negatives: int
 
     def precision(self, level: float = 0.95) -> Share:
-        """``TP / (TP + FP)`` with Wilson's interval, onions taken as independent."""
+        """Compute ``TP / (TP + FP)`` with Wilson's interval, onions taken as independent."""
         return wilson(self.true_positives, self.true_positives + self.false_positives, level)
 
     def recall(self, level: float = 0.95) -> Share:
-        """``TP / (TP + FN)`` with Wilson's interval, onions taken as independent."""
+        """Compute ``TP / (TP + FN)`` with Wilson's interval, onions taken as independent."""
         return wilson(self.true_positives, self.true_positives + self.false_negatives, level)
 
 
@@ -237,7 +237,7 @@ def behaviours(table: SortingTable) -> tuple[str, ...]:
 
 
 def cells(table: SortingTable, behaviour: str) -> list[tuple[str, ...]]:
-    """One behaviour as text, each line as :data:`HEADINGS`: simulated, then the dissertation's if any."""
+    """Format one behaviour as text, lines as :data:`HEADINGS`: simulated, then the dissertation's if any."""
 
     def percent(share: Share, digits: int) -> str:
         if math.isnan(share.value):
@@ -270,7 +270,7 @@ def print_sorting_table(table: SortingTable, console: Console) -> None:
 
 
 def sorting_table_plot(table: SortingTable, *, theme: Theme = LIGHT, title: str = "") -> Figure:
-    """Precision and recall of every method, a row of panels for each behaviour.
+    """Draw precision and recall of every method, a row of panels for each behaviour.
 
     Dots are ours; diamonds the dissertation's one belt. Bars are intervals, ours often hidden by the dot.
     """

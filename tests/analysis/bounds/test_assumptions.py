@@ -149,5 +149,5 @@ def test_what_cannot_be_checked_together_is_refused(random_mdp):
         check(bound, length=5)
     with pytest.raises(ValueError, match="features, but weights have shape"):
         check(bound, mdp=mdp, weights=np.ones(99))
-    with pytest.raises(ValueError, match="from its policy, weights and the MDP"):
+    with pytest.raises(ValueError, match="also needs `weights` and the MDP"):
         check(bound, expert=np.ones((2, 2)))

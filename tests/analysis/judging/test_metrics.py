@@ -215,7 +215,7 @@ def test_a_failed_run_shows_in_the_band() -> None:
 
 
 def test_a_band_needs_runs_and_a_share() -> None:
-    with pytest.raises(ValueError, match="at least one run"):
+    with pytest.raises(ValueError, match="at least one replication"):
         metrics.quantile_band(np.zeros((0, 3)))
     with pytest.raises(ValueError, match="coverage"):
         metrics.quantile_band(np.zeros((2, 3)), 1.0)

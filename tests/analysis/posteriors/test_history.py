@@ -186,7 +186,7 @@ def test_a_fleet_has_the_history_of_each_of_its_streams(mdp, learner):
 
 
 def test_what_is_no_history_is_refused(learner, run):
-    with pytest.raises(ValueError, match="at least one session, got no infos"):
+    with pytest.raises(ValueError, match="at least one session; got no infos"):
         run_history(learner, [])
     with pytest.raises(ValueError, match="a run or a list of infos; got int"):
         run_history(learner, [1, 2])

@@ -254,7 +254,7 @@ def test_command_writes_its_page(tmp_path, monkeypatch, page_faults):
     assert page_faults(page) == []
     assert "EM-MLIRL" in page
     assert page.count("<figure>") == 6
-    for name in ("clusters", "n_components", "evd", "number", "time", "table"):
+    for name in ("clusters", "components", "evd", "number", "time", "table"):
         assert (tmp_path / f"{name}-dark.png").exists()
 
 
