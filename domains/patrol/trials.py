@@ -231,6 +231,7 @@ def breach_trials(
     # One compiled program serves learning times of about the same length.
     length = 64 * math.ceil((max(deadline, observed_steps) + 1) / 64) + settings.horizon
     true_policy = jnp.log(jnp.asarray(patrol.expert_policy()))
+    one, other = interaction.equilibrium
     ended, waited = _trials(
         jax.random.split(key, trials),
         jnp.asarray(ready),
@@ -242,7 +243,7 @@ def breach_trials(
             world, breach_task(patrol, believed.reach), settings, believed, jnp.array(observed_steps),
             jnp.array(deadline),
         ),
-        _Lengths(settings.horizon, length, Interaction(tuple(interaction.equilibrium), interaction.length)),
+        _Lengths(settings.horizon, length, Interaction((one, other), interaction.length)),
         planning.watcher, planning.forecast, planning.go,
     )  # fmt: skip
     return BreachOutcome(np.asarray(ended), np.asarray(waited), float(threshold))
