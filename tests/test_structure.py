@@ -200,3 +200,20 @@ for use in (lambda: airl(), lambda: ppo(), lambda: noisy_airl(), lambda: ssrr())
         raise AssertionError("it ran without the extra")
 """
     subprocess.run([sys.executable, "-c", script], check=True, timeout=300)
+
+
+def parameters(node: ast.FunctionDef) -> list[str]:
+    """Named parameters of a function; options that travel together in ``**options`` are none."""
+    names = node.args.posonlyargs + node.args.args + node.args.kwonlyargs
+    return [name.arg for name in names if name.arg not in ("self", "cls")]
+
+
+def test_at_most_six_functions_take_more_than_eight_parameters():
+    # Typer needs an argument for each option of a command.
+    many = [
+        f"{path.relative_to(ROOT)}: {node.name}"
+        for path in MODULES
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.FunctionDef) and len(parameters(node)) > 8
+    ]
+    assert len(many) <= 6, many

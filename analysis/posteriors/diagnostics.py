@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 from importlib.metadata import version
-from typing import Any
+from typing import Any, Unpack
 
 import arviz as az
 import jax
@@ -20,7 +20,7 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Array
 
-from ...inference.posteriors.chains import in_threads
+from ...inference.posteriors.chains import Sampling, SamplingOptions, in_threads
 from ...inference.posteriors.weights import (
     Chain,
     Problem,
@@ -160,11 +160,7 @@ def posterior_by_session(
     *,
     trajectories: int = 1,
     prior: dist.Distribution | None = None,
-    draws: int = 500,
-    warmup: int = 300,
-    chains: int = 4,
-    target_accept: float = 0.9,
-    max_tree_depth: int = 10,
+    **sampling: Unpack[SamplingOptions],
 ) -> az.InferenceData:
     """Sample posteriors over the weights after so many sessions, each from all data up to then.
 
@@ -192,14 +188,9 @@ def posterior_by_session(
     DemonstrationError, ValueError
         As there, and ``ValueError`` for sessions that do not exist or do not increase.
     """
-    for name, number, least in (
-        ("draws", draws, 1),
-        ("chains", chains, 1),
-        ("warmup", warmup, 0),
-        ("trajectories", trajectories, 1),
-    ):
-        if number < least:
-            raise ValueError(f"{name} must be at least {least}, got {number}")
+    draws, warmup, chains, target_accept, max_tree_depth = Sampling(**sampling).checked()
+    if trajectories < 1:
+        raise ValueError(f"trajectories must be at least 1, got {trajectories}")
     key, demonstration = as_key(key), checked_demonstration(mdp, demonstration)
     last = -(-demonstration.n_trajectories // trajectories)
     numbers = [int(number) for number in at]

@@ -231,8 +231,7 @@ def breach_trials(
     # One compiled program serves learning times of about the same length.
     length = 64 * math.ceil((max(deadline, observed_steps) + 1) / 64) + settings.horizon
     true_policy = jnp.log(jnp.asarray(patrol.expert_policy()))
-    first, second = interaction.equilibrium
-    hashable = Interaction((first, second), interaction.length)
+    one, other = interaction.equilibrium
     ended, waited = _trials(
         jax.random.split(key, trials),
         jnp.asarray(ready),
@@ -251,7 +250,7 @@ def breach_trials(
             jnp.array(observed_steps),
             jnp.array(deadline),
         ),
-        _Lengths(settings.horizon, length, hashable),
+        _Lengths(settings.horizon, length, Interaction((one, other), interaction.length)),
         planning.watcher,
         planning.forecast,
         planning.go,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
@@ -30,6 +30,25 @@ from ..programs.maximum_entropy import (
 )
 from ..sessions.schedule import Schedule, program_slack, require_slack
 from ..sessions.statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
+
+# Lemma 2 with eps_s = 0.05 and delta_s = 0.1 for six features (section 7.4.1).
+DEFAULT_DRAWS = 957
+
+
+class Alternation(NamedTuple):
+    """Number and tolerance of a session's E- and M-steps, and the draws of an estimated E-step."""
+
+    iterations: int = 10
+    tolerance: float = 1e-3
+    draws: int = DEFAULT_DRAWS
+
+
+class AlternationOptions(TypedDict, total=False):
+    """:class:`Alternation` as keyword arguments."""
+
+    iterations: int
+    tolerance: float
+    draws: int
 
 
 @shown_briefly

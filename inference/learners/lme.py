@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -43,6 +43,8 @@ from ..sessions.scaling import on_scaled_features
 from ..sessions.schedule import Schedule, described, require_slack_in
 from ..sessions.statistic import Completed, blend
 from .alternation import (
+    Alternation,
+    AlternationOptions,
     Method,
     checked_method,
     exponentiated,
@@ -53,8 +55,6 @@ from .alternation import (
 
 # Nats per trajectory and unit of scaled weight. A smaller slack admits nearly deterministic experts.
 DEFAULT_SLACK = 0.002
-# Lemma 2 with eps_s = 0.05 and delta_s = 0.1 for six features (section 7.4.1).
-DEFAULT_DRAWS = 957
 
 
 @shown_briefly
@@ -106,10 +106,8 @@ def lme_i2rl(
     solver: str = "newton",
     slack: Schedule = DEFAULT_SLACK,
     ridge: float = 0.0,
-    draws: int = DEFAULT_DRAWS,
-    iterations: int = 10,
-    tolerance: float = 1e-3,
     name: str = "LME-I2RL",
+    **alternation: Unpack[AlternationOptions],
 ) -> Learner:
     """Build online latent maximum-entropy IRL (Algorithm 1).
 
@@ -122,7 +120,7 @@ def lme_i2rl(
     statistic : {"seen", "counts", "features"}
         Summary of a session; see :mod:`i2rl.inference.sessions.statistic`.
     completion : {"exact", "blocked", "gibbs"}
-        The E-step: exact, or estimated from ``draws``.
+        The E-step: exact, or estimated from ``draws`` (957 by default).
     solver : {"newton", "ipopt", "cvxpy", "exponentiated gradient"}
         The M-step: proximal Newton in JAX; the CasADi program with IPOPT, warm-started from the last
         session; the CVXPY primal; the normalised exponentiated gradient as printed. The last two solve the
@@ -137,8 +135,8 @@ def lme_i2rl(
         Precision of a Gaussian prior on the scaled weights (nats in all, not per trajectory); for the newton
         and ipopt solvers.
     iterations, tolerance : int, float
-        A session ends after this number of E- and M-steps, or when no scaled weight moves by more than
-        ``tolerance`` relative to the largest.
+        A session ends after this number of E- and M-steps (10 by default), or when no scaled weight moves by
+        more than ``tolerance`` (1e-3 by default) relative to the largest.
 
     Returns
     -------
@@ -151,6 +149,7 @@ def lme_i2rl(
     ValueError
         For discount 1, an unknown option, or a slack that is negative or not a number.
     """
+    iterations, tolerance, draws = steps = Alternation(**alternation)
     require_discounted(mdp)
     sensor = fitting_sensor(sensor, mdp)
 
@@ -168,7 +167,7 @@ def lme_i2rl(
             "sensor": digest_of(sensor),
         }
         start = partial(_carried_on, method)
-        return _learner(name, method, start, solver, iterations, tolerance, configuration)
+        return _learner(name, method, start, solver, steps, configuration)
 
     return on_scaled_features(mdp, build)
 
@@ -198,8 +197,7 @@ def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: AnySensor, **options: 
             method,
             start,
             configuration["solver"],
-            configuration["iterations"],
-            configuration["tolerance"],
+            Alternation(configuration["iterations"], configuration["tolerance"]),
             configuration,
         )
 
@@ -235,20 +233,27 @@ class _Ending(NamedTuple):
     reached: Bool[Array, ""]
 
 
+class _Session(NamedTuple):
+    """A session's number, the statistic of earlier ones, and its evidence and observed steps."""
+
+    number: Int[Array, ""]
+    kept: Any
+    evidence: Evidence
+    seen: Bool[Array, "n L"]
+
+
 def _em(
     method: Method,
     m_step: Callable[..., Solution],
-    iterations: int,
-    tolerance: float,
-    session: Int[Array, ""],
-    kept: Any,
-    evidence: Evidence,
-    seen: Bool[Array, "n L"],
+    alternation: Alternation,
+    session: _Session,
     key: Array,
     weights: Float[Array, " K"],
     values: Float[Array, " S"],
 ) -> _Ending:
-    """Run the E- and M-steps of the session with this number in one compiled loop, and one more E-step."""
+    """Run the E- and M-steps of a session in one compiled loop, and one more E-step."""
+    iterations, tolerance, _ = alternation
+    number, kept, evidence, seen = session
 
     @jax.jit  # traced once, though its shapes are asked for below
     def complete_under(point: _Iterate) -> tuple[Array, SoftPlan, Completed]:
@@ -259,7 +264,7 @@ def _em(
     def improve(point: _Iterate, plan: SoftPlan, completed: Completed) -> _Iterate:
         working = blend(kept, method.statistic.of_session(method.mdp, plan, completed))
         solution = m_step(
-            method.mdp, working, *method.penalties(working, session), WarmStart(point.weights, plan.values)
+            method.mdp, working, *method.penalties(working, number), WarmStart(point.weights, plan.values)
         )
         gradient = lax.cond(
             point.iterations == 0, lambda: method.gradient(plan, working), lambda: point.gradient
@@ -324,11 +329,11 @@ def _learner(
     method: Method,
     start: Callable[[Array, LMEState], tuple],
     solver: str,
-    iterations: int,
-    tolerance: float,
+    alternation: Alternation,
     configuration: Mapping[str, Any],
 ) -> Learner:
     mdp = method.mdp
+    iterations, tolerance, _ = alternation
     in_jax = {"newton": newton, "exponentiated gradient": exponentiated}
     if solver not in (*in_jax, "ipopt", "cvxpy"):
         raise ValueError(f"solver must be newton, ipopt, cvxpy or exponentiated gradient, got {solver!r}")
@@ -354,12 +359,8 @@ def _learner(
             ending = _em(
                 method,
                 in_jax[solver],
-                iterations,
-                tolerance,
-                state.session + 1,
-                state.statistic,
-                evidence,
-                seen,
+                alternation,
+                _Session(state.session + 1, state.statistic, evidence, seen),
                 key,
                 weights,
                 values,
@@ -530,12 +531,8 @@ def batch_lme(
             ending = _em(
                 method,
                 newton,
-                iterations,
-                tolerance,
-                jnp.ones((), int),
-                kept,
-                evidence,
-                seen,
+                Alternation(iterations, tolerance),
+                _Session(jnp.ones((), int), kept, evidence, seen),
                 key,
                 weights,
                 jnp.zeros(mdp.n_states),

@@ -12,7 +12,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -134,18 +134,36 @@ class MixtureInfo(NamedTuple):
     responsibilities: Float[np.ndarray, "n D"]
 
 
+class MixtureSettings(NamedTuple):
+    """Settings of MME-MTIRL, see :func:`mme_mtirl`."""
+
+    n_components: int = DEFAULT_COMPONENTS
+    strength: float = 1.0
+    temperature: float = 0.5
+    slack: float = 0.0
+    ridge: float = DEFAULT_RIDGE
+    restarts: int = DEFAULT_RESTARTS
+    iterations: int = 50
+    tolerance: float = 1e-6
+
+
+class MixtureOptions(TypedDict, total=False):
+    """:class:`MixtureSettings` as keyword arguments."""
+
+    n_components: int
+    strength: float
+    temperature: float
+    slack: float
+    ridge: float
+    restarts: int
+    iterations: int
+    tolerance: float
+
+
 def mme_mtirl(
     mdp: TabularMDP,
     sensor: AnySensor | None = None,
-    *,
-    n_components: int = DEFAULT_COMPONENTS,
-    strength: float = 1.0,
-    temperature: float = 0.5,
-    slack: float = 0.0,
-    ridge: float = DEFAULT_RIDGE,
-    restarts: int = DEFAULT_RESTARTS,
-    iterations: int = 50,
-    tolerance: float = 1e-6,
+    **settings: Unpack[MixtureOptions],
 ) -> Learner:
     """Build online MME-MTIRL: a session learns from its trajectories and the statistic of earlier ones (5.2).
 
@@ -160,10 +178,10 @@ def mme_mtirl(
     sensor : Imperfection, optional
         Visibility and noise; without it everything is seen.
     n_components : int
-        Largest number of components at a time, ``D``.
+        Largest number of components at a time, ``D``; 4 by default.
     strength : float
         ``lambda`` of the entropic prior on the proportions, ``exp(-lambda H(pi))``: the min-entropy half of
-        program (5.1). The dissertation's is 1.
+        program (5.1). The default is the dissertation's, 1.
     temperature : float
         Weight of a nat of the assignments' entropy, in nats of likelihood; see
         :mod:`~i2rl.inference.mixtures.fit`. With 0.5 (the default) the mixture prefers several deterministic
@@ -171,10 +189,12 @@ def mme_mtirl(
     slack, ridge : float
         Rate of a Laplace and precision of a Gaussian prior on each scaled weight (nats in all, not per
         trajectory), the reward in nats that a feature adds at most (:mod:`~i2rl.models.process.units`).
+        The defaults are 0 and 0.02.
     restarts : int
-        Number of seedings of the empty slots.
+        Number of seedings of the empty slots; 4 by default.
     iterations, tolerance : int, float
-        A climb ends after this number of alternations, or when one gains less than ``tolerance`` nats.
+        A climb ends after this number of alternations (50 by default), or when one gains less than
+        ``tolerance`` nats (1e-6 by default).
 
     Returns
     -------
@@ -188,24 +208,13 @@ def mme_mtirl(
     ValueError
         For discount 1, fewer than one component, or settings that are negative or not finite.
     """
+    chosen = MixtureSettings(**settings)
     sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
 
     def build(mdp: TabularMDP) -> Learner:
-        program = _program(
-            mdp, n_components, strength, temperature, slack, ridge, restarts, iterations, tolerance
-        )
-        configuration = {
-            "n_components": n_components,
-            "strength": strength,
-            "temperature": temperature,
-            "slack": slack,
-            "ridge": ridge,
-            "restarts": restarts,
-            "iterations": iterations,
-            "tolerance": tolerance,
-            "sensor": digest_of(sensor),
-        }
-        return _learner(program, sensor, n_components, restarts, configuration)
+        program = _program(mdp, chosen)
+        configuration = {**chosen._asdict(), "sensor": digest_of(sensor)}
+        return _learner(program, sensor, chosen.n_components, chosen.restarts, configuration)
 
     return on_scaled_features(mdp, build)
 
@@ -270,15 +279,7 @@ class BatchMixture(NamedTuple):
 def batch_mme_mtirl(
     mdp: TabularMDP,
     sensor: AnySensor | None = None,
-    *,
-    n_components: int = DEFAULT_COMPONENTS,
-    strength: float = 1.0,
-    temperature: float = 0.5,
-    slack: float = 0.0,
-    ridge: float = DEFAULT_RIDGE,
-    restarts: int = DEFAULT_RESTARTS,
-    iterations: int = 50,
-    tolerance: float = 1e-6,
+    **settings: Unpack[MixtureOptions],
 ) -> BatchMixture:
     """Build batch MME-MTIRL (section 5.1): the alternation from several seedings; the best is returned.
 
@@ -287,12 +288,12 @@ def batch_mme_mtirl(
     warning, and at most one component per trajectory. ``fit`` raises :class:`DemonstrationError` as
     :func:`mme_mtirl` does.
     """
+    chosen = MixtureSettings(**settings)
+    n_components, restarts = chosen.n_components, chosen.restarts
     sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
     scale = np.asarray(feature_scale(mdp))
     mdp = with_scaled_features(mdp)
-    program = _program(
-        mdp, n_components, strength, temperature, slack, ridge, restarts, iterations, tolerance
-    )
+    program = _program(mdp, chosen)
     nothing, empty = nothing_kept(mdp, n_components), empty_mixture(mdp, n_components)
 
     def fit(key: Array, demonstration: Demonstration) -> Clustering:
@@ -378,17 +379,8 @@ def _assigned(
 # -- building blocks ----------------------------------------------------------------------------------
 
 
-def _program(
-    mdp: TabularMDP,
-    n_components: int,
-    strength: float,
-    temperature: float,
-    slack: float,
-    ridge: float,
-    restarts: int,
-    iterations: int,
-    tolerance: float,
-) -> MixtureProgram:
+def _program(mdp: TabularMDP, settings: MixtureSettings) -> MixtureProgram:
+    n_components, strength, temperature, slack, ridge, restarts, iterations, tolerance = settings
     require_discounted(mdp)
     for name, number in (("n_components", n_components), ("restarts", restarts), ("iterations", iterations)):
         if not number >= 1:

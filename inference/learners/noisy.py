@@ -13,7 +13,7 @@ import time
 import warnings
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
@@ -55,7 +55,7 @@ from ..sessions.learner import Learner, digest_of, in_plain_numbers
 from ..sessions.scaling import on_scaled_features
 from ..sessions.schedule import Schedule, described, require_slack, require_slack_in
 from ..sessions.statistic import blend, complete
-from .alternation import Method, checked_method, newton, random_weights, relative_change
+from .alternation import Alternation, Method, checked_method, newton, random_weights, relative_change
 from .lme import Batch, batch_lme
 
 Scores = Literal["stepwise", "averaged", "none"]
@@ -130,25 +130,61 @@ class RIMEOInfo(NamedTuple):
     agreement: Float[np.ndarray, " J"]
 
 
+class RIFOMSettings(NamedTuple):
+    """Settings of the predicates and of the alternation, see :func:`rimeo`."""
+
+    reportable: ArrayLike | None = None
+    names: tuple[str, ...] | None = None
+    forgetting: float = DEFAULT_FORGETTING
+    iterations: int = DEFAULT_ITERATIONS
+    tolerance: float = 1e-3
+
+
+class RIFOMOptions(TypedDict, total=False):
+    """:class:`RIFOMSettings` as keyword arguments."""
+
+    reportable: ArrayLike | None
+    names: tuple[str, ...] | None
+    forgetting: float
+    iterations: int
+    tolerance: float
+
+
+class RIMEOSettings(NamedTuple):
+    """Settings of the predicates, of the comparison of observations, and of the alternation."""
+
+    reportable: ArrayLike | None = None
+    names: tuple[str, ...] | None = None
+    forgetting: float = DEFAULT_FORGETTING
+    iterations: int = DEFAULT_ITERATIONS
+    tolerance: float = 1e-3
+    scores: Scores = "stepwise"
+    truths: Truths = "posterior"
+    unscored: bool = False
+    errors: float = DEFAULT_ERRORS
+    start: ArrayLike = DEFAULT_START
+
+
+class RIMEOOptions(RIFOMOptions, total=False):
+    """:class:`RIMEOSettings` as keyword arguments."""
+
+    scores: Scores
+    truths: Truths
+    unscored: bool
+    errors: float
+    start: ArrayLike
+
+
 def rimeo(
     mdp: TabularMDP,
     predicates: ArrayLike,
     *,
     view: AnySensor | None = None,
-    reportable: ArrayLike | None = None,
-    scores: Scores = "stepwise",
-    truths: Truths = "posterior",
-    unscored: bool = False,
     solver: str = "newton",
     statistic: str = "seen",
     slack: Schedule = 0.0,
     ridge: float = DEFAULT_RIDGE,
-    errors: float = DEFAULT_ERRORS,
-    start: ArrayLike = DEFAULT_START,
-    forgetting: float = DEFAULT_FORGETTING,
-    iterations: int = DEFAULT_ITERATIONS,
-    tolerance: float = 1e-3,
-    names: tuple[str, ...] | None = None,
+    **settings: Unpack[RIMEOOptions],
 ) -> Learner:
     """Build online IRL that also learns the sensor's noise (Algorithm 2).
 
@@ -163,6 +199,10 @@ def rimeo(
         perception may confuse all pairs that they do not distinguish.
     view : Sensor, optional
         A ``Visibility``; everything is in view by default.
+    solver : {"newton", "ipopt"}
+        Both programs in compiled JAX, or in CasADi, each started from its last solution.
+    statistic, slack, ridge
+        As for :func:`~i2rl.inference.lme_i2rl`.
     reportable : bool ``[S, A]``, optional
         Pairs that perception may report; all by default.
     scores : {"stepwise", "averaged", "none"}
@@ -174,21 +214,18 @@ def rimeo(
         truth (sessions must then be :class:`WithTruth`); every pair alike, as Eq. 6.7 is printed.
     unscored : bool
         Allow observations without a score if ``scores`` are used: they inform agreement as all observations
-        do with ``scores="none"``.
-    solver : {"newton", "ipopt"}
-        Both programs in compiled JAX, or in CasADi, each started from its last solution.
-    statistic, slack, ridge
-        As for :func:`~i2rl.inference.lme_i2rl`.
+        do with ``scores="none"``; False by default.
     errors : float
-        Slack of the observation program: expected agreement may be off by this number of observations in all.
-        It keeps the reliability of a predicate that was never wrong below one.
+        Slack of the observation program: expected agreement may be off by this number of observations in all
+        (0.25 by default). It keeps the reliability of a predicate that was never wrong below one.
     start : float or float ``[J]``
-        Assumed agreement of the predicates before the first session.
+        Assumed agreement of the predicates before the first session; 0.75 by default.
     forgetting : float
-        Exponent of the weight of earlier sessions, see :func:`~i2rl.inference.sessions.statistic.blend`.
+        Exponent of the weight of earlier sessions (0.8 by default), see
+        :func:`~i2rl.inference.sessions.statistic.blend`.
     iterations, tolerance : int, float
-        A session ends after this number of alternations, or when no weight (relative to the largest) and no
-        agreement moves by more than ``tolerance``.
+        A session ends after this number of alternations (2 by default), or when no weight (relative to the
+        largest) and no agreement moves by more than ``tolerance`` (1e-3 by default).
     names : tuple of str, optional
         Names of the predicates, for messages.
 
@@ -209,6 +246,9 @@ def rimeo(
     UserWarning
         Naming predicates with one value on all reportable pairs, which carry no information.
     """
+    chosen = RIMEOSettings(**settings)
+    reportable, names, forgetting, iterations, tolerance = chosen[:5]
+    scores, truths, unscored, errors, start = chosen[5:]
     seen = _checked_view(mdp, view, slack)
     psi = _checked_predicates(mdp, predicates, reportable, names)
     for name, value, options in (
@@ -254,15 +294,13 @@ def rimeo(
         return _learner(
             name,
             method,
-            perception,
-            _half_sure(psi, reportable),
+            _Sensing(
+                perception, _half_sure(psi, reportable), first_logits, scores != "none" and not unscored
+            ),
             configuration,
-            first_logits,
             forgetting,
-            iterations,
-            tolerance,
+            Alternation(iterations, tolerance),
             solver,
-            scores != "none" and not unscored,
         )
 
     return on_scaled_features(mdp, build)
@@ -274,14 +312,10 @@ def rifom(
     *,
     form: Literal["fair", "coded"] = "fair",
     view: AnySensor | None = None,
-    reportable: ArrayLike | None = None,
     statistic: str = "seen",
     slack: Schedule = 0.0,
     ridge: float = DEFAULT_RIDGE,
-    forgetting: float = DEFAULT_FORGETTING,
-    iterations: int = DEFAULT_ITERATIONS,
-    tolerance: float = 1e-3,
-    names: tuple[str, ...] | None = None,
+    **settings: Unpack[RIFOMOptions],
 ) -> Learner:
     """Build RIFOM (section 7.3): RIMEO with reliabilities by counting and observations taken for the truth.
 
@@ -289,6 +323,7 @@ def rifom(
     (as in the released program, see ``coded_perception``; predicates must then be true or false). Other
     parameters and errors as for :func:`rimeo`.
     """
+    reportable, names, forgetting, iterations, tolerance = RIFOMSettings(**settings)
     seen = _checked_view(mdp, view, slack)
     psi = _checked_predicates(mdp, predicates, reportable, names)
     if form not in ("fair", "coded"):
@@ -315,15 +350,11 @@ def rifom(
         return _learner(
             f"RIFOM ({form})",
             method,
-            perception,
-            _half_sure(psi, reportable),
+            _Sensing(perception, _half_sure(psi, reportable), first_logits, scores_needed=False),
             configuration,
-            first_logits,
             forgetting,
-            iterations,
-            tolerance,
+            Alternation(iterations, tolerance),
             "newton",
-            False,
         )
 
     return on_scaled_features(mdp, build)
@@ -512,19 +543,26 @@ class _Alternation(NamedTuple):
         return jax.tree.map(partial(jnp.where, possible), learned, spared), RIMEOInfo(**report)
 
 
+class _Sensing(NamedTuple):
+    """The learned perception, the sensor that bounds it, its first logits, and its need of scores."""
+
+    perception: Perception
+    reporting: FeatureNoise
+    first_logits: Float[Array, " J"]
+    scores_needed: bool
+
+
 def _learner(
     name: str,
     method: Method,
-    perception: Perception,
-    reporting: FeatureNoise,
+    sensing: _Sensing,
     configuration: Mapping[str, Any],
-    first_logits: Float[Array, " J"],
     forgetting: float,
-    iterations: int,
-    tolerance: float,
+    alternation: Alternation,
     solver: str,
-    scores_needed: bool,
 ) -> Learner:
+    perception, reporting, first_logits, scores_needed = sensing
+    iterations, tolerance, _ = alternation
     if iterations < 1:
         raise ValueError(f"a session needs at least one iteration, got {iterations}")
     if not 0 < forgetting <= 1:

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple, TypedDict, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -26,6 +26,38 @@ from ...models.inputs.display import shown_briefly
 _MAX_STRETCH = 10.0
 
 Drawn = TypeVar("Drawn")
+
+
+class Sampling(NamedTuple):
+    """Lengths and number of NUTS's chains, and NumPyro's settings of the sampler."""
+
+    draws: int = 500
+    warmup: int = 300
+    chains: int = 4
+    target_accept: float = 0.9
+    max_tree_depth: int = 10
+
+    def but(self, options: SamplingOptions) -> Sampling:
+        """Return these settings with some replaced; ``TypeError`` for an unknown option."""
+        fields: dict[str, Any] = {**self._asdict(), **options}
+        return Sampling(**fields)
+
+    def checked(self) -> Sampling:
+        """Return the settings; ``ValueError`` for numbers of draws or chains below one."""
+        for name, least in (("draws", 1), ("chains", 1), ("warmup", 0)):
+            if getattr(self, name) < least:
+                raise ValueError(f"{name} must be at least {least}, got {getattr(self, name)}")
+        return self
+
+
+class SamplingOptions(TypedDict, total=False):
+    """:class:`Sampling` as keyword arguments."""
+
+    draws: int
+    warmup: int
+    chains: int
+    target_accept: float
+    max_tree_depth: int
 
 
 @shown_briefly

@@ -10,7 +10,7 @@ There is one slot per trajectory, so the slots always suffice.
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import arviz as az
 import jax
@@ -94,19 +94,25 @@ def reference_gaussian(prior: dist.Distribution) -> Reference:
     return Reference(jnp.asarray(middle), jnp.diag(jnp.asarray(high - low) / 2))
 
 
+class Sweeps(NamedTuple):
+    """Lengths of a chain, and the work of one iteration, see :func:`gibbs_mixture_posterior`."""
+
+    warmup: int
+    draws: int
+    auxiliary: int = 3
+    moves: int = 4
+    thin: int = 1
+
+
 def gibbs_chain(
     key: Array,
     problem: MixtureProblem,
     reference: Reference,
     state: Seating,
-    *,
-    warmup: int,
-    draws: int,
-    auxiliary: int = 3,
-    moves: int = 4,
-    thin: int = 1,
+    sweeps: Sweeps,
 ) -> Seated:
     """Run one chain; traceable. Return ``draws``, every ``thin``-th iteration after at least ``warmup``."""
+    warmup, draws, auxiliary, moves, thin = sweeps
     step = partial(sweep, problem=problem, reference=reference, auxiliary=auxiliary, moves=moves)
     constrain = dist.biject_to(problem.prior.support)
 
@@ -121,7 +127,7 @@ def gibbs_chain(
     return jax.tree.map(lambda x: x[begin:], chain)
 
 
-_run_chain = jax.jit(gibbs_chain, static_argnames=("warmup", "draws", "auxiliary", "moves", "thin"))
+_run_chain = jax.jit(gibbs_chain, static_argnames="sweeps")
 
 
 def sweep(
@@ -344,6 +350,28 @@ def _break_all(keys: Array, seated: Seated, prior: dist.Distribution, components
     return jax.vmap(lambda k, s: break_remainder(k, s, prior, components))(keys, seated)
 
 
+class GibbsSampling(NamedTuple):
+    """Lengths and number of chains, and the work of one iteration."""
+
+    draws: int = 500
+    warmup: int = 200
+    chains: int = 4
+    auxiliary: int = 3
+    moves: int = 4
+    thin: int = 1
+
+
+class GibbsSamplingOptions(TypedDict, total=False):
+    """:class:`GibbsSampling` as keyword arguments."""
+
+    draws: int
+    warmup: int
+    chains: int
+    auxiliary: int
+    moves: int
+    thin: int
+
+
 def gibbs_mixture_posterior(
     key: Array,
     mdp: TabularMDP,
@@ -353,12 +381,7 @@ def gibbs_mixture_posterior(
     components: int = COMPONENTS,
     concentration: float | dist.Distribution = 1.0,
     prior: dist.Distribution | None = None,
-    draws: int = 500,
-    warmup: int = 200,
-    chains: int = 4,
-    auxiliary: int = 3,
-    moves: int = 4,
-    thin: int = 1,
+    **sampling: Unpack[GibbsSamplingOptions],
 ) -> az.InferenceData:
     """Draw from the posterior of the Dirichlet process that :func:`mixture_model` truncates.
 
@@ -368,17 +391,19 @@ def gibbs_mixture_posterior(
 
     Parameters
     ----------
-    key, mdp, sensor, demonstration, concentration, prior, draws, chains
+    key, mdp, sensor, demonstration, concentration, prior
         As in :func:`sample_mixture_posterior`.
     components : int
         Components in the output: the occupied ones, then others by stick-breaking. There are more if a draw
         has more occupied components, so that none is lost.
+    draws, chains : int
+        Draws returned by each chain, and number of chains; 500 and 4 by default.
     warmup, thin : int
-        Iterations discarded by each chain, and iterations per returned draw.
+        Iterations discarded by each chain, and iterations per returned draw; 200 and 1 by default.
     auxiliary : int
-        New components offered to a trajectory, Neal's ``m``.
+        New components offered to a trajectory, Neal's ``m``; 3 by default.
     moves : int
-        Slice moves of each component's weights in an iteration.
+        Slice moves of each component's weights in an iteration; 4 by default.
 
     Returns
     -------
@@ -391,6 +416,7 @@ def gibbs_mixture_posterior(
     DemonstrationError, ValueError
         As :func:`sample_mixture_posterior`; also for ``auxiliary``, ``moves`` or ``thin`` below one.
     """
+    draws, warmup, chains, auxiliary, moves, thin = GibbsSampling(**sampling)
     key = as_key(key)
     problem, demonstration, present = pose(
         mdp,
@@ -410,7 +436,7 @@ def gibbs_mixture_posterior(
     )
     start_key, chain_key, break_key, resolve_key = jax.random.split(key, 4)
     reference = reference_gaussian(problem.prior)
-    run = partial(_run_chain, warmup=warmup, draws=draws, auxiliary=auxiliary, moves=moves, thin=thin)
+    run = partial(_run_chain, sweeps=Sweeps(warmup, draws, auxiliary, moves, thin))
     begins = [_seat(problem, start) for start in starts(start_key, problem, chains, len(problem.rows))]
     keys = jax.random.split(chain_key, chains)
     seated: Seated = in_threads(run, [(k, problem, reference, s) for k, s in zip(keys, begins, strict=True)])

@@ -8,7 +8,7 @@ posterior.
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 
 import arviz as az
 import jax
@@ -25,7 +25,7 @@ from ...models.laws.mixture import COMPONENTS, stick_proportions
 from ...models.observation.demonstration import Demonstration
 from ...models.observation.evidence import AnySensor
 from ...models.process.mdp import TabularMDP
-from .chains import Transitions, in_threads, run_nuts
+from .chains import Sampling, SamplingOptions, Transitions, in_threads, run_nuts
 from .mixture_problem import (
     MixtureProblem,
     Position,
@@ -108,6 +108,9 @@ def _start_position(key: Array, start: Start, problem: MixtureProblem, component
     return position
 
 
+_SAMPLING = Sampling(warmup=500, max_tree_depth=8)
+
+
 def sample_mixture_posterior(
     key: Array,
     mdp: TabularMDP,
@@ -117,11 +120,7 @@ def sample_mixture_posterior(
     components: int = COMPONENTS,
     concentration: float | dist.Distribution = 1.0,
     prior: dist.Distribution | None = None,
-    draws: int = 500,
-    warmup: int = 500,
-    chains: int = 4,
-    target_accept: float = 0.9,
-    max_tree_depth: int = 8,
+    **sampling: Unpack[SamplingOptions],
 ) -> az.InferenceData:
     """Draw from the posterior of :func:`mixture_model` by NUTS, then assignments given each draw.
 
@@ -147,9 +146,9 @@ def sample_mixture_posterior(
         Prior of each component's scaled weights (:mod:`~i2rl.models.process.units`), see
         :func:`~i2rl.models.weights_prior`.
     draws, warmup, chains : int
-        Draws returned and discarded by each chain, and number of chains.
+        Draws returned and discarded by each chain, and number of chains; 500, 500 and 4 by default.
     target_accept, max_tree_depth
-        As in NumPyro's ``NUTS``.
+        As in NumPyro's ``NUTS``; 0.9 and 8 by default.
 
     Returns
     -------
@@ -173,6 +172,7 @@ def sample_mixture_posterior(
         For an empty demonstration, a prior of another shape, a concentration that is not positive, numbers of
         components, draws or chains below one, or an undiscounted MDP.
     """
+    draws, warmup, chains, target_accept, max_tree_depth = _SAMPLING.but(sampling)
     key = as_key(key)
     problem, demonstration, present = pose(
         mdp,

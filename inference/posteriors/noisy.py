@@ -6,7 +6,7 @@ NUTS moves in weights and logits of reliabilities, with the truth behind every o
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Unpack
 
 import arviz as az
 import jax
@@ -35,7 +35,7 @@ from ...models.observation.evidence import (
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted
 from ...version import __version__
-from .chains import Mode, Transitions, in_threads, mode_of, run_nuts
+from .chains import Mode, Sampling, SamplingOptions, Transitions, in_threads, mode_of, run_nuts
 from .weights import described_prior, fingerprint, gather
 
 # Nats: chains do not start at modes that hold less than e^-this of the best one.
@@ -228,6 +228,12 @@ def noisy_problem(
     )
 
 
+class NoisySamplingOptions(SamplingOptions, total=False):
+    """Options of the sampler, and the names of the predicates."""
+
+    names: tuple[str, ...] | None
+
+
 def sample_noisy_posterior(
     key: Array,
     mdp: TabularMDP,
@@ -238,12 +244,7 @@ def sample_noisy_posterior(
     reportable: ArrayLike | None = None,
     prior: dist.Distribution | None = None,
     reliability_prior: dist.Distribution | None = None,
-    names: tuple[str, ...] | None = None,
-    draws: int = 500,
-    warmup: int = 300,
-    chains: int = 4,
-    target_accept: float = 0.9,
-    max_tree_depth: int = 10,
+    **sampling: Unpack[NoisySamplingOptions],
 ) -> az.InferenceData:
     """Draw from the joint posterior over weights and reliabilities of :func:`noisy_behaviour_model`.
 
@@ -261,9 +262,9 @@ def sample_noisy_posterior(
     names : tuple of str, optional
         Names of the predicates; ``psi1``, ``psi2``, ... by default.
     draws, warmup, chains : int
-        Draws returned and discarded by each chain, and number of chains.
+        Draws returned and discarded by each chain, and number of chains; 500, 300 and 4 by default.
     target_accept, max_tree_depth
-        As in NumPyro's ``NUTS``.
+        As in NumPyro's ``NUTS``; 0.9 and 10 by default.
 
     Returns
     -------
@@ -281,9 +282,8 @@ def sample_noisy_posterior(
         For an empty demonstration, predicates, priors or names that do not fit, numbers of draws or chains
         below one, or an undiscounted MDP.
     """
-    for name, number, least in (("draws", draws, 1), ("chains", chains, 1), ("warmup", warmup, 0)):
-        if number < least:
-            raise ValueError(f"{name} must be at least {least}, got {number}")
+    names = sampling.pop("names", None)
+    draws, warmup, chains, target_accept, max_tree_depth = Sampling().but(sampling).checked()
     problem, rows = noisy_problem(
         mdp,
         predicates,

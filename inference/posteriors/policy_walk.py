@@ -7,7 +7,7 @@ the box ``[-1, 1]^K``, and its steps a random walk reflected at the walls.
 from __future__ import annotations
 
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypedDict, Unpack
 
 import arviz as az
 import jax
@@ -66,7 +66,15 @@ class Walk(NamedTuple):
     step_size: Float[Array, "..."]
 
 
-@partial(jax.jit, static_argnames=("chains", "warmup", "draws"))
+class _Lengths(NamedTuple):
+    """Numbers for which a walk is compiled."""
+
+    chains: int
+    warmup: int
+    draws: int
+
+
+@partial(jax.jit, static_argnames="lengths")
 def _walk(
     key: Array,
     mdp: TabularMDP,
@@ -74,10 +82,10 @@ def _walk(
     prior: dist.Distribution | None,
     rationality: Float[Array, ""],
     step: Float[Array, ""],
-    chains: int,
-    warmup: int,
-    draws: int,
+    lengths: _Lengths,
 ) -> Walk:
+    chains, warmup, draws = lengths
+
     def evaluate(weights: Float[Array, " K"]) -> tuple:
         each = count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, rationality), counts)
         if prior is None:
@@ -124,6 +132,24 @@ def _walk(
     return lax.map(chain, jax.random.split(key, chains))
 
 
+class Walking(NamedTuple):
+    """Lengths and number of chains, and the initial width of their steps."""
+
+    draws: int = 2000
+    warmup: int = 1000
+    chains: int = 4
+    step: float = 0.1
+
+
+class WalkingOptions(TypedDict, total=False):
+    """:class:`Walking` as keyword arguments."""
+
+    draws: int
+    warmup: int
+    chains: int
+    step: float
+
+
 def birl(
     key: Array,
     mdp: TabularMDP,
@@ -131,10 +157,7 @@ def birl(
     *,
     rationality: float = ETA,
     prior: dist.Distribution | None = None,
-    draws: int = 2000,
-    warmup: int = 1000,
-    chains: int = 4,
-    step: float = 0.1,
+    **sampling: Unpack[WalkingOptions],
 ) -> az.InferenceData:
     """Draw from the posterior over weights of one Boltzmann expert.
 
@@ -151,9 +174,11 @@ def birl(
         Over ``K`` scaled weights, or over one and used for each; restricted to the box.
         Uniform on the box by default.
     draws, warmup, chains : int
-        Draws returned and discarded by each chain, and number of chains, which start at draws of the prior.
+        Draws returned and discarded by each chain, and number of chains, which start at draws of the prior;
+        2000, 1000 and 4 by default.
     step : float
-        Initial width of the random walk of scaled weights; tuned during the warm-up and then fixed.
+        Initial width of the random walk of scaled weights (0.1 by default); tuned during the warm-up and then
+        fixed.
 
     Returns
     -------
@@ -171,6 +196,7 @@ def birl(
         For numbers that are not positive, a prior of another shape or that excludes the whole box, or an
         undiscounted MDP.
     """
+    draws, warmup, chains, step = Walking(**sampling)
     require_discounted(mdp)
     require_positive(rationality=rationality, draws=draws, chains=chains, step=step)
     if warmup < 0:
@@ -186,9 +212,7 @@ def birl(
             prior,
             jnp.asarray(float(rationality)),
             jnp.asarray(float(step)),
-            chains,
-            warmup,
-            draws,
+            _Lengths(chains, warmup, draws),
         ),
     )
     if prior is not None and not np.isfinite(walk.lp[:, -1]).all():

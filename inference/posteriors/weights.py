@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Unpack
 
 import arviz as az
 import jax
@@ -40,7 +40,7 @@ from ...models.process.planning import require_discounted, reward_of, soft_plan
 from ...version import __version__
 from ..completion.smoothing import Evidence, evidence_of, log_likelihoods
 from ..sessions.progress import told
-from .chains import Mode, Transitions, in_threads, mode_of, room_for, run_nuts
+from .chains import Mode, Sampling, SamplingOptions, Transitions, in_threads, mode_of, room_for, run_nuts
 
 
 @shown_briefly
@@ -110,7 +110,15 @@ def _kernel(
 run_nuts_chain = jax.jit(nuts_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
 
 
-@partial(jax.jit, static_argnames=("warmup", "room", "max_tree_depth"))
+class _Lengths(NamedTuple):
+    """Numbers for which a chain is compiled."""
+
+    warmup: int
+    room: int
+    max_tree_depth: int
+
+
+@partial(jax.jit, static_argnames="lengths")
 def _run_roomy_chain(
     key: Array,
     problem: Problem,
@@ -119,11 +127,10 @@ def _run_roomy_chain(
     draws: Int[Array, ""],
     target_accept: Float[Array, ""],
     *,
-    warmup: int,
-    room: int,
-    max_tree_depth: int,
+    lengths: _Lengths,
 ) -> Chain:
-    """:func:`nuts_chain` with room for ``room`` draws, of which the first ``draws`` are made."""
+    """:func:`nuts_chain` with room for ``lengths.room`` draws, of which the first ``draws`` are made."""
+    warmup, room, max_tree_depth = lengths
     kernel = _kernel(problem, inverse_mass, target_accept, max_tree_depth)
     constrain = dist.biject_to(problem.prior.support)
     return Chain(*run_nuts(key, kernel, start, constrain, warmup, draws, room))
@@ -260,13 +267,9 @@ def sample_posterior(
     demonstration: Demonstration,
     *,
     prior: dist.Distribution | None = None,
-    draws: int = 500,
-    warmup: int = 300,
-    chains: int = 4,
     completions: bool = True,
-    target_accept: float = 0.9,
-    max_tree_depth: int = 10,
     progress: bool = False,
+    **sampling: Unpack[SamplingOptions],
 ) -> az.InferenceData:
     """Draw from the posterior over weights and hidden steps of :func:`occlusion_model`.
 
@@ -283,14 +286,14 @@ def sample_posterior(
         ``Normal(0, 2.5)`` by default, see :func:`~i2rl.models.weights_prior`. Larger weights always fit an
         expert without errors better: the prior alone limits them, and the weights' common length depends on
         it.
-    draws, warmup, chains : int
-        Draws returned and discarded by each chain, and number of chains.
     completions : bool
         True to draw the hidden steps too.
-    target_accept, max_tree_depth
-        As in NumPyro's ``NUTS``.
     progress : bool
         Says on standard error what is being done: finding the mode, sampling, completing.
+    draws, warmup, chains : int
+        Draws returned and discarded by each chain, and number of chains; 500, 300 and 4 by default.
+    target_accept, max_tree_depth
+        As in NumPyro's ``NUTS``; 0.9 and 10 by default.
 
     Returns
     -------
@@ -313,9 +316,7 @@ def sample_posterior(
         For an empty demonstration, a prior of another shape, numbers of draws or chains below one, or an
         undiscounted MDP.
     """
-    for name, number, least in (("draws", draws, 1), ("chains", chains, 1), ("warmup", warmup, 0)):
-        if number < least:
-            raise ValueError(f"{name} must be at least {least}, got {number}")
+    settings = Sampling(**sampling).checked()
     key, demonstration = as_key(key), checked_demonstration(mdp, demonstration)
     if demonstration.n_trajectories == 0:
         raise ValueError("the demonstration has no trajectories; without data the posterior is the prior")
@@ -323,10 +324,7 @@ def sample_posterior(
     problem, rows = gather(mdp, sensor, demonstration, prior)
     require_possible(sensor, mdp, demonstration)
     with told(progress) as tell:
-        idata = _sampled(
-            key, problem, rows, demonstration, draws, warmup, chains, completions, target_accept,
-            max_tree_depth, tell,
-        )  # fmt: skip
+        idata = _sampled(key, problem, rows, demonstration, settings, completions, tell)
     for attrs in (idata.attrs, idata["posterior"].attrs):
         attrs["key"] = str(np.asarray(jax.random.key_data(key)).tolist())
     return idata
@@ -337,21 +335,19 @@ def _sampled(
     problem: Problem,
     rows: Int[np.ndarray, " n"],
     demonstration: Demonstration,
-    draws: int,
-    warmup: int,
-    chains: int,
+    sampling: Sampling,
     completions: bool,
-    target_accept: float,
-    max_tree_depth: int,
     tell: Callable[[str], None],
 ) -> az.InferenceData:
+    draws, warmup, chains, target_accept, max_tree_depth = sampling
     tell("posterior: finding the mode, compiling first")
     mode = posterior_mode(problem)
     tell(f"posterior: {chains} chains of {warmup} + {draws} draws, compiling first")
     start_key, chain_key, completion_key = jax.random.split(key, 3)
     spread = 2.0 * np.linalg.cholesky(mode.covariance)
     starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
-    run = partial(_run_roomy_chain, warmup=warmup, room=_room_for_draws(draws), max_tree_depth=max_tree_depth)
+    lengths = _Lengths(warmup, _room_for_draws(draws), max_tree_depth)
+    run = partial(_run_roomy_chain, lengths=lengths)
     keys = jax.random.split(chain_key, chains)
     chain: Chain = in_threads(
         run,

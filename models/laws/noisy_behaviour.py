@@ -8,6 +8,8 @@ noise and sensor noise explain the data equally well.
 
 from __future__ import annotations
 
+from typing import NamedTuple, TypedDict, Unpack
+
 import jax
 import jax.numpy as jnp
 import numpyro
@@ -53,6 +55,20 @@ def reliabilities_prior(n_predicates: int, prior: dist.Distribution | None = Non
     return prior.to_event(len(prior.batch_shape))
 
 
+class NoisyPriors(NamedTuple):
+    """Priors of the scaled weights and of the reliabilities."""
+
+    prior: dist.Distribution | None = None
+    reliability_prior: dist.Distribution | None = None
+
+
+class NoisyPriorOptions(TypedDict, total=False):
+    """:class:`NoisyPriors` as keyword arguments."""
+
+    prior: dist.Distribution | None
+    reliability_prior: dist.Distribution | None
+
+
 def noisy_behaviour_model(
     mdp: TabularMDP,
     predicates: Bool[Array, "J S A"] | Int[Array, "J S A"],
@@ -62,9 +78,8 @@ def noisy_behaviour_model(
     reportable: Bool[Array, "S A"] | None = None,
     n_trajectories: int | None = None,
     length: int | None = None,
-    prior: dist.Distribution | None = None,
-    reliability_prior: dist.Distribution | None = None,
     repeats: Int[Array, " n"] | None = None,
+    **priors: Unpack[NoisyPriorOptions],
 ) -> Int[Array, "n L 3"]:
     r"""Define the NumPyro model of demonstrations under :class:`FeatureNoise` of unknown reliabilities.
 
@@ -86,11 +101,11 @@ def noisy_behaviour_model(
         As in ``FeatureNoise``.
     n_trajectories, length : int, optional
         ``n`` and ``L``, needed only without ``codes``.
+    repeats : int ``[n]``, optional
+        Count of each row of ``codes``, if identical trajectories were gathered.
     prior, reliability_prior : Distribution, optional
         Priors of the scaled weights, see :func:`~i2rl.models.weights_prior`, and of
         :func:`reliabilities_prior`.
-    repeats : int ``[n]``, optional
-        Count of each row of ``codes``, if identical trajectories were gathered.
 
     Returns
     -------
@@ -100,6 +115,7 @@ def noisy_behaviour_model(
     Raises ``ValueError`` for predicates, visibilities and priors that do not fit, and as ``TrajectoryLaw``
     does.
     """
+    prior, reliability_prior = NoisyPriors(**priors)
     if codes is not None:
         n_trajectories, length = codes.shape[0], codes.shape[1]
     if n_trajectories is None or length is None:
