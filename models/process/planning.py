@@ -60,7 +60,21 @@ class HardPlan(NamedTuple):
 
 
 def reward_of(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """Reward ``theta . phi(s, a)`` of every pair. Raises ``ValueError`` for a weight of NaN."""
+    """Reward ``theta . phi(s, a)`` of every pair. Raises ``ValueError`` for a weight of NaN.
+
+    See Also
+    --------
+    i2rl.models.soft_plan : the behaviour that a reward explains
+    i2rl.models.hard_plan : the behaviour that is best under it
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import reward_of
+    >>> corridor = five_cells()
+    >>> print(reward_of(corridor.mdp, corridor.weights)[4].round(1))  # at the end: left, right, stay
+    [1.8 1.8 2. ]
+    """
     if not is_traced(weights) and np.isnan(np.asarray(weights)).any():
         k = int(np.argwhere(np.isnan(np.asarray(weights)))[0, 0])
         raise ValueError(
@@ -107,6 +121,21 @@ def soft_plan(
     ``DIRECT_LIMIT`` states and Krylov solves beyond; to about 1e-12 of the values' scale, or as well as
     rounding allows where the discount is above 0.99. Raises ``ValueError`` for discount 1 and a
     reward of NaN; where the reward is traced, NaN makes the whole plan NaN.
+
+    See Also
+    --------
+    i2rl.models.hard_plan : the plan of an expert who never errs
+    i2rl.models.finite_soft_plan : the plan over a finite horizon
+    i2rl.models.reward_of : the reward of weights
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import reward_of, soft_plan
+    >>> corridor = five_cells()
+    >>> plan = soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights))
+    >>> print(plan.policy[0].round(1))  # in cell 0: left, right, stay
+    [0.2 0.7 0.2]
     """
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
@@ -149,6 +178,20 @@ def hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: float = 1
     ``tolerance`` is relative to the spread of the values. Policy iteration, with direct solves up to
     ``DIRECT_LIMIT`` states and Krylov solves beyond. Raises ``ValueError`` for discount 1 and a reward of
     NaN; where the reward is traced, NaN makes all values NaN and no action optimal.
+
+    See Also
+    --------
+    i2rl.models.soft_plan : the plan of an expert who errs
+    i2rl.models.deterministic_policy : a policy that takes one optimal action
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import hard_plan, reward_of
+    >>> corridor = five_cells()
+    >>> plan = hard_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights))
+    >>> print(plan.values.round(1), plan.optimal[0])  # in cell 0 only "right" is optimal
+    [11.8 13.5 15.4 17.6 20. ] [False  True False]
     """
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
@@ -176,7 +219,21 @@ def greedy_actions(q: Float[Array, "S A"], tolerance: float = 1e-9) -> Bool[Arra
 
 
 def deterministic_policy(optimal: Bool[Array, "S A"]) -> Float[Array, "S A"]:
-    """Policy that takes the first optimal action of each state with certainty; NaN where none is optimal."""
+    """Policy that takes the first optimal action of each state with certainty; NaN where none is optimal.
+
+    See Also
+    --------
+    i2rl.models.hard_plan : finds the optimal actions
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import deterministic_policy, hard_plan, reward_of
+    >>> corridor = five_cells()
+    >>> plan = hard_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights))
+    >>> deterministic_policy(plan.optimal).argmax(axis=1).tolist()  # to the right, and at the end stay
+    [1, 1, 1, 1, 2]
+    """
     first = jax.nn.one_hot(jnp.argmax(optimal, axis=1), optimal.shape[1])
     return jnp.where(jnp.any(optimal, axis=1, keepdims=True), first, jnp.nan)
 
@@ -375,7 +432,23 @@ def _by_column(function: Callable[[Float[Array, " S"]], Float[Array, " S"]], x: 
 def policy_values(
     mdp: TabularMDP, policy: Float[Array, "S A"], reward: Float[Array, "S A"]
 ) -> Float[Array, " S"]:
-    """Exact discounted values ``V^pi(s)`` of a policy under a reward."""
+    """Exact discounted values ``V^pi(s)`` of a policy under a reward.
+
+    See Also
+    --------
+    i2rl.models.hard_plan : the greatest values
+    i2rl.models.occupancy : the visits of a policy
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import policy_values, reward_of
+    >>> corridor = five_cells()
+    >>> uniform = np.full((5, 3), 1 / 3)
+    >>> print(policy_values(corridor.mdp, uniform, reward_of(corridor.mdp, corridor.weights)).round(1))
+    [-0.1  0.4  1.5  3.7  7.7]
+    """
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
     _require_numbers(mdp, "policy", policy)
@@ -391,7 +464,23 @@ def features_to_go(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array,
 def occupancy(
     mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, "S A"]:
-    """Discounted occupancy ``x(s, a) = sum_t gamma^t P(s_t = s, a_t = a)``; sums to ``1 / (1 - gamma)``."""
+    """Discounted occupancy ``x(s, a) = sum_t gamma^t P(s_t = s, a_t = a)``; sums to ``1 / (1 - gamma)``.
+
+    See Also
+    --------
+    i2rl.models.feature_expectations : the features that these visits collect
+    i2rl.models.simulate : draws a trajectory
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import occupancy, reward_of, soft_plan
+    >>> corridor = five_cells()
+    >>> policy = soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights)).policy
+    >>> visits = occupancy(corridor.mdp, policy).sum(axis=1)
+    >>> print(visits.round(1), visits.sum().round(1))  # 1 / (1 - discount) visits in all
+    [1.6 1.1 0.9 1.  5.4] 10.0
+    """
     _require_numbers(mdp, "policy", policy)
     initial = mdp.initial if initial is None else initial
     # The transpose of the linear map above; differentiating it gives the transposed solve.
@@ -402,7 +491,22 @@ def occupancy(
 def feature_expectations(
     mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, " K"]:
-    """Expected discounted features ``E_X[phi_k]`` of a policy."""
+    """Expected discounted features ``E_X[phi_k]`` of a policy.
+
+    See Also
+    --------
+    i2rl.models.occupancy : discounted visits of every pair
+    i2rl.inference.solve_dual : finds weights that match expected features
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import feature_expectations, reward_of, soft_plan
+    >>> corridor = five_cells()
+    >>> policy = soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights)).policy
+    >>> print(feature_expectations(corridor.mdp, policy).round(1))  # discounted steps at the end, and moves
+    [5.4 6.5]
+    """
     return jnp.einsum("sa,sak->k", occupancy(mdp, policy, initial), mdp.features)
 
 
@@ -431,7 +535,25 @@ class FinitePlan(NamedTuple):
 
 
 def finite_soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int) -> FinitePlan:
-    """Soft plan over ``horizon`` steps by one backward sweep; any discount in (0, 1]."""
+    """Soft plan over ``horizon`` steps by one backward sweep; any discount in (0, 1].
+
+    See Also
+    --------
+    i2rl.models.soft_plan : the plan over an infinite horizon
+    i2rl.inference.fit_weights : learns weights over a finite horizon
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import finite_soft_plan, reward_of
+    >>> corridor = five_cells()
+    >>> plan = finite_soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights), horizon=3)
+    >>> print(np.exp(plan.log_policy[:, 3]).round(1))  # cell 3: in the last step a move does not pay any more
+    [[0.  0.8 0.1]
+     [0.1 0.7 0.2]
+     [0.3 0.3 0.4]]
+    """
     _require_numbers(mdp, "reward", reward)
 
     def back(values: Float[Array, " S"], _: None) -> tuple:
@@ -492,7 +614,24 @@ def simulate(
     length: int,
     first: Int[Array, ""] | None = None,
 ) -> tuple[Int[Array, " T"], Int[Array, " T"]]:
-    """Draw one trajectory of ``length`` pairs (states, actions) under a policy, from ``first`` or ``p0``."""
+    """Draw one trajectory of ``length`` pairs (states, actions) under a policy, from ``first`` or ``p0``.
+
+    See Also
+    --------
+    i2rl.models.sample_demonstration : simulates trajectories and observes them
+    i2rl.models.observe : passes a trajectory through a sensor
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import reward_of, simulate, soft_plan
+    >>> corridor = five_cells()
+    >>> plan = soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights))
+    >>> states, actions = simulate(jax.random.key(0), corridor.mdp, plan.log_policy, 6)
+    >>> int(states[0]), actions.shape
+    (0, (6,))
+    """
     _require_numbers(mdp, "log-policy", log_policy)
     start_key, key = jax.random.split(as_key(key))
     state = jax.random.categorical(start_key, jnp.log(mdp.initial)) if first is None else jnp.asarray(first)
