@@ -140,7 +140,7 @@ def sample_demonstration(key: Array, law: TrajectoryLaw, n_trajectories: int) ->
     >>> corridor = five_cells()
     >>> law = TrajectoryLaw(corridor.mdp, corridor.weights, corridor.sensor, 6)
     >>> demonstration = sample_demonstration(jax.random.key(1), law, 8)
-    >>> demonstration.lengths.tolist(), demonstration.state[:, 0].tolist()  # everybody begins in cell 0
+    >>> demonstration.lengths.tolist(), demonstration.state[:, 0].tolist()  # all begin in cell 0
     ([6, 6, 6, 6, 6, 6, 6, 6], [0, 0, 0, 0, 0, 0, 0, 0])
     """
     return Demonstration.from_codes(np.asarray(law.sample(key, (n_trajectories,))))

@@ -546,7 +546,7 @@ def log_evidence(sensor: AnySensor, mdp: TabularMDP, demonstration: Demonstratio
 
     See Also
     --------
-    i2rl.models.Sensor : the sensors that there are, and their products
+    i2rl.models.Sensor : sensors and their products
     i2rl.inference.expectations : completes a demonstration by its evidence
 
     Examples

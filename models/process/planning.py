@@ -124,7 +124,7 @@ def soft_plan(
 
     See Also
     --------
-    i2rl.models.hard_plan : the plan of an expert who never errs
+    i2rl.models.hard_plan : the plan of a deterministic expert
     i2rl.models.finite_soft_plan : the plan over a finite horizon
     i2rl.models.reward_of : the reward of weights
 
@@ -181,7 +181,7 @@ def hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: float = 1
 
     See Also
     --------
-    i2rl.models.soft_plan : the plan of an expert who errs
+    i2rl.models.soft_plan : the plan of a stochastic expert
     i2rl.models.deterministic_policy : a policy that takes one optimal action
 
     Examples
