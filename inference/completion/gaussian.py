@@ -462,6 +462,20 @@ def gaussian_truth(
     ------
     ValueError
         For invalid covariances or those of another size, bounds out of order, and no draws.
+
+    See Also
+    --------
+    i2rl.inference.robust_airl : a learner with this truth
+    i2rl.models.GaussianSensor : the sensor
+
+    Examples
+    --------
+    >>> from i2rl.domains import onion_reaching
+    >>> from i2rl.inference import gaussian_truth
+    >>> robot = onion_reaching()  # 29 observations, 3 actions
+    >>> truth = gaussian_truth(robot, robot.observation_size, draws=2)
+    >>> truth.draws, truth.model.initial_mean.shape
+    (2, (29,))
     """
     if draws < 1:
         raise ValueError(f"draws must be at least 1, got {draws}")

@@ -76,12 +76,50 @@ def smooth_all(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evide
 def log_likelihoods(
     mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence
 ) -> Float[Array, " n"]:
-    """Return the exact log-likelihood of each trajectory."""
+    """Return the exact log-likelihood of each trajectory.
+
+    See Also
+    --------
+    i2rl.inference.expectations : completes the trajectories
+    i2rl.models.log_evidence : the evidence
+    i2rl.models.TrajectoryLaw : the same likelihood as a NumPyro distribution
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import log_likelihoods
+    >>> from i2rl.inference.completion.smoothing import evidence_of
+    >>> from i2rl.models import reward_of, soft_plan
+    >>> mdp, weights, sensor, demonstration = five_cells()
+    >>> plan, evidence = soft_plan(mdp, reward_of(mdp, weights)), evidence_of(mdp, sensor, demonstration)
+    >>> each = log_likelihoods(mdp, plan.log_policy, evidence)
+    >>> each.shape, bool((each < 0).all())  # in nats
+    ((8,), True)
+    """
     return filter_all(mdp, evidence.log_evidence + log_policy, evidence.live).log_likelihood
 
 
 def expectations(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Expectations:
-    """Run the exact E-step (Eq. 4.1 with the sum over completions carried out)."""
+    """Run the exact E-step (Eq. 4.1 with the sum over completions carried out).
+
+    See Also
+    --------
+    i2rl.inference.log_likelihoods : the likelihoods alone
+    i2rl.inference.sample_completions : draws completions
+    i2rl.inference.fit_counts : the weights that explain the visits
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import expectations
+    >>> from i2rl.inference.completion.smoothing import evidence_of
+    >>> from i2rl.models import reward_of, soft_plan
+    >>> mdp, weights, sensor, demonstration = five_cells()
+    >>> plan, evidence = soft_plan(mdp, reward_of(mdp, weights)), evidence_of(mdp, sensor, demonstration)
+    >>> completed = expectations(mdp, plan.log_policy, evidence)
+    >>> int(completed.size), round(float(completed.counts.sum()))  # trajectories, and their steps
+    (8, 48)
+    """
     return collect(mdp, smooth_all(mdp, log_policy, evidence), evidence.live)
 
 
@@ -105,7 +143,27 @@ def collect(mdp: TabularMDP, posterior: Smoothed, live: Bool[Array, "n L"]) -> E
 def sample_completions(
     key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, draws: int
 ) -> tuple[Int[Array, "draws n L"], Int[Array, "draws n L"]]:
-    """Draw independent joint completions (states, actions) by backward sampling; -1 on padding."""
+    """Draw independent joint completions (states, actions) by backward sampling; -1 on padding.
+
+    See Also
+    --------
+    i2rl.inference.expectations : sums over all completions
+    i2rl.inference.sample_posterior : draws weights and completions
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_completions
+    >>> from i2rl.inference.completion.smoothing import evidence_of
+    >>> from i2rl.models import Demonstration, reward_of, soft_plan
+    >>> mdp, weights, sensor, _ = five_cells()
+    >>> walk = Demonstration.from_arrays([[0, 1, -1, -1, 4]], [[1, 1, -1, -1, 2]], missing=-1)
+    >>> plan, evidence = soft_plan(mdp, reward_of(mdp, weights)), evidence_of(mdp, sensor, walk)
+    >>> states, _ = sample_completions(jax.random.key(0), mdp, plan.log_policy, evidence, 5)
+    >>> states[:, 0].tolist()  # each draw goes the only way, through cells 2 and 3
+    [[0, 1, 2, 3, 4], [0, 1, 2, 3, 4], [0, 1, 2, 3, 4], [0, 1, 2, 3, 4], [0, 1, 2, 3, 4]]
+    """
 
     factors = evidence.log_evidence + log_policy
 

@@ -156,6 +156,23 @@ def darko_i2rl(
     ------
     ValueError
         For discount 1 or an option that is out of range.
+
+    See Also
+    --------
+    i2rl.inference.me_i2rl : maximum entropy in sessions
+    i2rl.inference.run_sessions : runs the sessions of a stream
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import darko_i2rl
+    >>> from i2rl.models import Demonstration
+    >>> learner = darko_i2rl(five_cells().mdp)
+    >>> walk = Demonstration.from_pairs([[0, 1, 2, 3, 4, 4]], [[1, 1, 1, 1, 2, 2]])
+    >>> state, info = learner.update(learner.init(jax.random.key(0)), walk)
+    >>> bool(state.weights[0] > 0), info.gradient > 0  # the end is worth something
+    (True, True)
     """
     return on_scaled_features(mdp, partial(_learner, learning_rate, decay, radius, steps))
 

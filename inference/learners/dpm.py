@@ -334,6 +334,23 @@ def dpm_birl(
     ------
     ValueError
         For numbers that are not positive, a ``sigma`` above 0.5, or an undiscounted MDP.
+
+    See Also
+    --------
+    i2rl.inference.em_mlirl : a mixture whose size is given
+    i2rl.inference.gibbs_mixture_posterior : the posterior with hidden steps
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import dpm_birl
+    >>> from i2rl.models import Demonstration
+    >>> walks = Demonstration.from_pairs([[0, 1, 2, 3]] * 2 + [[0] * 4] * 2, [[1] * 4] * 2 + [[2] * 4] * 2)
+    >>> learner = dpm_birl(five_cells().mdp, iterations=5)
+    >>> found = learner.fit(jax.random.key(0), walks)
+    >>> learner.name, found.assignments.shape
+    ('DPM-BIRL', (4,))
     """
     require_discounted(mdp)
     require_positive(

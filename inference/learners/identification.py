@@ -108,6 +108,24 @@ def sensor_identification(
     ValueError
         For weights or predicates of the wrong shape, unknown options, and a demonstration without
         observations or with an impossible one.
+
+    See Also
+    --------
+    i2rl.inference.rimeo : learns the reward and the sensor
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sensor_identification
+    >>> corridor = five_cells()
+    >>> predicates = np.indices((5, 3))  # the cell and the action of each pair
+    >>> options = {"view": corridor.sensor, "scores": "none"}
+    >>> found = sensor_identification(
+    ...     corridor.mdp, predicates, corridor.demonstration, corridor.weights, **options
+    ... )
+    >>> found.erratic.shape, found.identified.shape
+    ((2,), (2,))
     """
     return sensor_identifier(mdp, predicates, **options)(demonstration, weights)
 

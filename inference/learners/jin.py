@@ -126,6 +126,23 @@ def jin_i2rl(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner:
     ------
     ValueError
         For discount 1 or a learning rate that is not positive.
+
+    See Also
+    --------
+    i2rl.inference.darko_i2rl : another learner of pairs that are seen
+    i2rl.inference.run_sessions : runs the sessions of a stream
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import jin_i2rl
+    >>> from i2rl.models import Demonstration
+    >>> learner = jin_i2rl(five_cells().mdp)
+    >>> walk = Demonstration.from_pairs([[0, 1, 2, 3, 4, 4]], [[1, 1, 1, 1, 2, 2]])
+    >>> state, info = learner.update(learner.init(jax.random.key(0)), walk)
+    >>> state.weights.shape, info.iterations  # a reward for each cell; pairs
+    ((5,), 6)
     """
     return _learner("Jin et al.", with_state_features(mdp), learning_rate)
 

@@ -148,6 +148,23 @@ def lme_i2rl(
     ------
     ValueError
         For discount 1, an unknown option, or a slack that is negative or not a number.
+
+    See Also
+    --------
+    i2rl.inference.me_i2rl : the learner under full observability
+    i2rl.inference.batch_lme : all trajectories at once
+    i2rl.inference.run_sessions : runs the sessions of a stream
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import lme_i2rl
+    >>> corridor = five_cells()
+    >>> learner = lme_i2rl(corridor.mdp, corridor.sensor)
+    >>> state, info = learner.update(learner.init(jax.random.key(0)), corridor.demonstration)
+    >>> learner.name, info.session, bool(state.weights[0] > 0)  # the end is worth something
+    ('LME-I2RL', 1, True)
     """
     iterations, tolerance, draws = steps = Alternation(**alternation)
     require_discounted(mdp)
@@ -208,6 +225,23 @@ def me_i2rl(mdp: TabularMDP, **options: Any) -> Learner:
     """Build online maximum-entropy IRL under full observability; options as for :func:`lme_i2rl`.
 
     Theorem 1 is about the program that ``statistic="features"`` solves.
+
+    See Also
+    --------
+    i2rl.inference.lme_i2rl : the learner for hidden steps
+    i2rl.inference.run_sessions : runs the sessions of a stream
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import me_i2rl
+    >>> from i2rl.models import Demonstration
+    >>> learner = me_i2rl(five_cells().mdp)
+    >>> walk = Demonstration.from_pairs([[0, 1, 2, 3, 4, 4]], [[1, 1, 1, 1, 2, 2]])
+    >>> state, info = learner.update(learner.init(jax.random.key(0)), walk)
+    >>> bool(state.weights[0] > 0)  # the end is worth something
+    True
     """
     return lme_i2rl(mdp, Sensor(), name="ME-I2RL", **options)
 
@@ -509,6 +543,22 @@ def batch_lme(
 
     Parameters as for :func:`lme_i2rl`, except that ``slack`` is a number. ``fit`` raises
     :class:`DemonstrationError` for an impossible observation.
+
+    See Also
+    --------
+    i2rl.inference.lme_i2rl : learns session by session
+    i2rl.inference.sample_posterior : draws from the posterior
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import batch_lme
+    >>> corridor = five_cells()
+    >>> learner = batch_lme(corridor.mdp, corridor.sensor, restarts=1)
+    >>> fit = learner.fit(jax.random.key(0), corridor.demonstration)
+    >>> bool(fit.weights[0] > 0)  # the end is worth something
+    True
     """
     require_discounted(mdp)
     if restarts < 1 or iterations < 1:

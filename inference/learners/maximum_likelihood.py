@@ -150,6 +150,22 @@ def mlirl(
         Naming trajectory and step, for a step that was hidden or that is impossible.
     ValueError
         For a ``rationality``, ``restarts`` or ``iterations`` that is not positive, or an undiscounted MDP.
+
+    See Also
+    --------
+    i2rl.inference.em_mlirl : a mixture of experts
+    i2rl.inference.birl : the posterior of the same expert
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import mlirl
+    >>> from i2rl.models import Demonstration
+    >>> walk = Demonstration.from_pairs([[0, 1, 2, 3, 4, 4]], [[1, 1, 1, 1, 2, 2]])
+    >>> fit = mlirl(jax.random.key(0), five_cells().mdp, walk, restarts=1, iterations=20)
+    >>> fit.weights.shape, bool(fit.weights[0] > 0)  # the end is worth something
+    ((2,), True)
     """
     require_discounted(mdp)
     require_positive(rationality=rationality, restarts=restarts, iterations=iterations)
@@ -303,6 +319,25 @@ def em_mlirl(
     ------
     ValueError
         For numbers that are not positive, or an undiscounted MDP.
+
+    See Also
+    --------
+    i2rl.inference.mlirl : one expert
+    i2rl.inference.dpm_birl : a mixture of unknown size
+    i2rl.inference.batch_mme_mtirl : a mixture with hidden steps
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import em_mlirl
+    >>> from i2rl.models import Demonstration
+    >>> walks = Demonstration.from_pairs([[0, 1, 2, 3]] * 2 + [[0] * 4] * 2, [[1] * 4] * 2 + [[2] * 4] * 2)
+    >>> learner = em_mlirl(five_cells().mdp, n_components=2, iterations=5)
+    >>> found = learner.fit(jax.random.key(0), walks)
+    >>> ours = found.assignments  # two who walk, two who stay
+    >>> bool(ours[0] == ours[1] != ours[2] == ours[3])
+    True
     """
     require_discounted(mdp)
     require_positive(

@@ -207,6 +207,23 @@ def mme_mtirl(
     ------
     ValueError
         For discount 1, fewer than one component, or settings that are negative or not finite.
+
+    See Also
+    --------
+    i2rl.inference.batch_mme_mtirl : all trajectories at once
+    i2rl.inference.lme_i2rl : one reward
+    i2rl.inference.run_sessions : runs the sessions of a stream
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import mme_mtirl
+    >>> corridor = five_cells()
+    >>> learner = mme_mtirl(corridor.mdp, corridor.sensor, n_components=2, restarts=1, iterations=5)
+    >>> state, info = learner.update(learner.init(jax.random.key(0)), corridor.demonstration)
+    >>> state.weights.shape, round(float(state.mass.sum()))  # every trajectory has its component
+    ((2, 2), 8)
     """
     chosen = MixtureSettings(**settings)
     sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
@@ -287,6 +304,22 @@ def batch_mme_mtirl(
     the min-max-entropy program's objective ``J``. With fewer trajectories than ``n_components`` there is a
     warning, and at most one component per trajectory. ``fit`` raises :class:`DemonstrationError` as
     :func:`mme_mtirl` does.
+
+    See Also
+    --------
+    i2rl.inference.mme_mtirl : learns session by session
+    i2rl.inference.sample_mixture_posterior : draws from the posterior of a mixture
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import batch_mme_mtirl
+    >>> corridor = five_cells()
+    >>> learner = batch_mme_mtirl(corridor.mdp, corridor.sensor, n_components=2, restarts=1, iterations=5)
+    >>> found = learner.fit(jax.random.key(0), corridor.demonstration)
+    >>> print(found.proportions.sum().round(6), found.assignments.shape)
+    1.0 (8,)
     """
     chosen = MixtureSettings(**settings)
     n_components, restarts = chosen.n_components, chosen.restarts

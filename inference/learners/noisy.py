@@ -245,6 +245,25 @@ def rimeo(
     -----
     UserWarning
         Naming predicates with one value on all reportable pairs, which carry no information.
+
+    See Also
+    --------
+    i2rl.inference.rifom : counts agreement instead
+    i2rl.inference.robust_irl : the reliabilities are known
+    i2rl.models.FeatureNoise : the sensor that is learned
+
+    Examples
+    --------
+    >>> import jax
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import rimeo
+    >>> corridor = five_cells()
+    >>> predicates = np.indices((5, 3))  # the cell and the action of each pair
+    >>> learner = rimeo(corridor.mdp, predicates, view=corridor.sensor, scores="none")
+    >>> state, info = learner.update(learner.init(jax.random.key(0)), corridor.demonstration)
+    >>> learner.name, info.reliabilities.shape, bool((info.agreement > 0.5).all())  # mostly right
+    ('RIMEO', (2,), True)
     """
     chosen = RIMEOSettings(**settings)
     reportable, names, forgetting, iterations, tolerance = chosen[:5]
@@ -322,6 +341,24 @@ def rifom(
     ``form`` is ``"fair"`` (all steps, weighted by scores if there are any, Laplace-smoothed) or ``"coded"``
     (as in the released program, see ``coded_perception``; predicates must then be true or false). Other
     parameters and errors as for :func:`rimeo`.
+
+    See Also
+    --------
+    i2rl.inference.rimeo : infers the truth behind each observation
+    i2rl.models.FeatureNoise : the sensor that is learned
+
+    Examples
+    --------
+    >>> import jax
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import rifom
+    >>> corridor = five_cells()
+    >>> predicates = np.indices((5, 3))  # the cell and the action of each pair
+    >>> learner = rifom(corridor.mdp, predicates, view=corridor.sensor)
+    >>> state, info = learner.update(learner.init(jax.random.key(0)), corridor.demonstration)
+    >>> learner.name, info.reliabilities.shape
+    ('RIFOM (fair)', (2,))
     """
     reportable, names, forgetting, iterations, tolerance = RIFOMSettings(**settings)
     seen = _checked_view(mdp, view, slack)
@@ -365,6 +402,24 @@ def robust_irl(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Batch:
 
     Batch latent maximum-entropy IRL under that sensor; options and errors as for
     :func:`~i2rl.inference.batch_lme`. Raises ``ValueError`` for a sensor without an observation model.
+
+    See Also
+    --------
+    i2rl.inference.rimeo : learns the sensor, too
+    i2rl.inference.batch_lme : the same program for any sensor
+
+    Examples
+    --------
+    >>> import jax
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import robust_irl
+    >>> from i2rl.models import FeatureNoise
+    >>> corridor = five_cells()
+    >>> noise = FeatureNoise(np.indices((5, 3)), [0.9, 0.9])  # of the cell and of the action
+    >>> learner = robust_irl(corridor.mdp, noise * corridor.sensor, restarts=1, iterations=20)
+    >>> learner.fit(jax.random.key(0), corridor.demonstration).weights.shape
+    (2,)
     """
     sensor = fitting_sensor(sensor, mdp)
     if sensor.noise is None:

@@ -176,6 +176,20 @@ def fit_weights(
         For wrong shapes, a horizon below 1, and targets that are not numbers.
     UnmatchedError
         If no policy collects the target, or the tolerance is finer than the arithmetic; names the feature.
+
+    See Also
+    --------
+    i2rl.inference.solve_dual : the program over an infinite horizon
+    i2rl.models.finite_soft_plan : the policy of the weights
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import fit_weights
+    >>> fit = fit_weights(five_cells().mdp, horizon=6, target=np.array([0.8, 3.5]))
+    >>> print(fit.weights.shape, np.abs(fit.gap).max() < 1e-5)  # the policy collects the target
+    (2,) True
     """
     _check(horizon, tolerance)
     target = _vector("target", target, mdp.n_features, "features")

@@ -130,6 +130,23 @@ def solve_dual(
     ------
     ValueError
         For discount 1, or arrays of the wrong shape.
+
+    See Also
+    --------
+    i2rl.inference.DualProgram : the same program with IPOPT
+    i2rl.inference.PrimalProgram : its primal with CVXPY
+    i2rl.inference.fit_weights : the program over a finite horizon
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import solve_dual
+    >>> from i2rl.inference.programs.constraints import FeatureTarget
+    >>> from i2rl.models import feature_expectations, reward_of, soft_plan
+    >>> mdp, weights, *_ = five_cells()
+    >>> target = feature_expectations(mdp, soft_plan(mdp, reward_of(mdp, weights)).policy)
+    >>> print(solve_dual(mdp, FeatureTarget(target, mdp.initial)).weights.round(2))  # those of the expert
+    [ 2.  -0.2]
     """
     require_discounted(mdp)
     features, initial = shaped_target(mdp, target)
@@ -180,6 +197,21 @@ def fit_counts(
     ------
     ValueError
         For discount 1, or arrays of the wrong shape.
+
+    See Also
+    --------
+    i2rl.inference.expectations : expected visits of a demonstration
+    i2rl.inference.solve_dual : matches features instead
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import fit_counts
+    >>> from i2rl.models import occupancy, reward_of, soft_plan
+    >>> mdp, weights, *_ = five_cells()
+    >>> visits = occupancy(mdp, soft_plan(mdp, reward_of(mdp, weights)).policy)
+    >>> print(fit_counts(mdp, 100 * visits).weights.round(2))  # the weights of the expert
+    [ 2.  -0.2]
     """
     require_discounted(mdp)
     scale = feature_scale(mdp)

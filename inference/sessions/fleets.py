@@ -34,6 +34,23 @@ def fleet(learner: Learner) -> Fleet:
     are not checked: an impossible one gives a demonstration log-likelihood of minus infinity, and leaves its
     learner's state unchanged. On a CPU the streams run in sequence: lanes of a mapped loop would all wait for
     the slowest of them, at every level of nested loops.
+
+    See Also
+    --------
+    i2rl.inference.run_streams : runs whole streams
+    i2rl.inference.run_sessions : runs one stream, with checks
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import fleet, lme_i2rl
+    >>> corridor = five_cells()
+    >>> learners = fleet(lme_i2rl(corridor.mdp, corridor.sensor))
+    >>> streams = jax.tree.map(lambda x: x.reshape(4, 2, 6), corridor.demonstration)  # of 2 trajectories
+    >>> states, info = learners.update(learners.init(jax.random.key(0), 4), streams)
+    >>> states.weights.shape, info.session.tolist()
+    ((4, 2), [1, 1, 1, 1])
     """
     if learner.session is None:
         raise ValueError(
@@ -67,6 +84,23 @@ def run_streams(
     info by default): arrays ``[R, T]``. Streams run one after the other. Observations are not checked, as in
     a fleet; stream ``i`` gets the key of stream ``i`` of a fleet. Raises ``ValueError`` for a learner whose
     solver runs outside JAX, or arrays of another rank.
+
+    See Also
+    --------
+    i2rl.inference.fleet : runs one session of every stream
+    i2rl.inference.run_sessions : runs one stream, with checks
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import lme_i2rl, run_streams
+    >>> corridor = five_cells()
+    >>> streams = jax.tree.map(lambda x: x.reshape(2, 2, 2, 6), corridor.demonstration)  # of two sessions
+    >>> learner = lme_i2rl(corridor.mdp, corridor.sensor)
+    >>> states, infos = run_streams(learner, jax.random.key(0), streams)
+    >>> states.weights.shape, infos.session.tolist()
+    ((2, 2), [[1, 2], [1, 2]])
     """
     if learner.session is None:
         raise ValueError(f"{learner.name} solves its programs outside JAX, so it cannot run compiled streams")

@@ -118,6 +118,23 @@ def run_sessions(
         other sessions than ``state``; or if the stream is not that of the journal.
 
     Errors of ``update`` pass through; the state before it stays valid.
+
+    See Also
+    --------
+    i2rl.inference.lme_i2rl : a learner
+    i2rl.inference.Journal : keeps the sessions on disk
+    i2rl.inference.run_streams : runs a learner over many streams
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import lme_i2rl, run_sessions
+    >>> corridor = five_cells()
+    >>> learner = lme_i2rl(corridor.mdp, corridor.sensor)
+    >>> run = run_sessions(learner, corridor.demonstration.sessions(2), key=jax.random.key(0))
+    >>> [info.session for info in run.infos], bool(run.state.weights[0] > 0)  # the end is worth something
+    ([1, 2, 3, 4], True)
     """
     _require_stream(stream)
     if journal is not None:
@@ -207,6 +224,17 @@ def average_regret(
     axes are streams. It has the form of chapter 4, ``LL(theta_E | X_i, .) - LL(theta^i | X_i, .)``, whose two
     sides share their data; Definition 8 prints the previous session's estimate on the previous session's
     data. Raises ``ValueError`` if shapes differ.
+
+    See Also
+    --------
+    i2rl.inference.run_sessions : runs the sessions
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.inference import average_regret
+    >>> average_regret(np.array([-1.0, -1.0, -1.0]), np.array([-3.0, -2.0, -1.0])).tolist()
+    [2.0, 1.5, 1.0]
     """
     expert, learned = np.asarray(expert, float), np.asarray(learned, float)
     if expert.shape != learned.shape or expert.ndim < 1:

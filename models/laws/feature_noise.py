@@ -72,6 +72,22 @@ def observation_feature_model(
     ValueError
         For bad predicates, matches that do not fit the observations, scores outside [0, 1], a prior that is
         not positive, and another number of names than of predicates.
+
+    See Also
+    --------
+    i2rl.models.FeatureNoise : the sensor
+    i2rl.inference.ObservationProgram : the maximum-entropy program of the same reliabilities
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.models import observation_feature_model
+    >>> from i2rl.models.observation.agreement import ReportedMatches
+    >>> predicates = np.indices((5, 3))  # the cell and the action of each pair
+    >>> reported = ReportedMatches(np.full((5, 3), 2.0), np.array([27.0, 24.0]))  # of 30 reports
+    >>> model = observation_feature_model(predicates, reported, names=("cell", "action"))
+    >>> [x.name for x in model.free_RVs], [x.name for x in model.observed_RVs], model.coords["predicate"]
+    (['reliability'], ['matches'], ('cell', 'action'))
     """
     classes = predicate_classes(predicates, reportable)
     n_predicates = classes.vectors.shape[1]

@@ -313,6 +313,23 @@ def mixture_model(
     The site ``demonstration`` (None if it was prepared). Other sites: ``weights [T, K]``,
     ``sticks [T - 1]`` (if ``T > 1``), deterministic ``proportions [T]``, ``concentration`` if it is
     random, and ``assignment [n]`` in simulations.
+
+    See Also
+    --------
+    i2rl.inference.sample_mixture_posterior : NUTS for this model
+    i2rl.inference.gibbs_mixture_posterior : a Gibbs sampler without truncation
+    i2rl.models.occlusion_model : the model of one reward
+
+    Examples
+    --------
+    >>> import jax
+    >>> from numpyro.infer import Predictive
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import mixture_model
+    >>> corridor, simulate = five_cells(), Predictive(mixture_model, num_samples=10)
+    >>> draws = simulate(jax.random.key(0), corridor.mdp, corridor.sensor, n_trajectories=8, length=6)
+    >>> draws["weights"].shape, draws["assignment"].shape  # ten components by default
+    ((10, 10, 2), (10, 8))
     """
     if components < 1:
         raise ValueError(f"a mixture needs at least one component, got {components}")

@@ -114,6 +114,25 @@ def noisy_behaviour_model(
 
     Raises ``ValueError`` for predicates, visibilities and priors that do not fit, and as ``TrajectoryLaw``
     does.
+
+    See Also
+    --------
+    i2rl.inference.sample_noisy_posterior : NUTS for this model
+    i2rl.models.FeatureNoise : the sensor
+    i2rl.models.observation_feature_model : the model of the reliabilities alone
+
+    Examples
+    --------
+    >>> import jax
+    >>> import numpy as np
+    >>> from numpyro.infer import Predictive
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import noisy_behaviour_model
+    >>> simulate = Predictive(noisy_behaviour_model, num_samples=10)
+    >>> predicates = np.indices((5, 3))  # the cell and the action of each pair
+    >>> draws = simulate(jax.random.key(0), five_cells().mdp, predicates, n_trajectories=8, length=6)
+    >>> draws["reliabilities"].shape, draws["demonstration"].shape
+    ((10, 2), (10, 8, 6, 3))
     """
     prior, reliability_prior = NoisyPriors(**priors)
     if codes is not None:

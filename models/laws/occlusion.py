@@ -35,6 +35,19 @@ def weights_prior(n_features: int, prior: dist.Distribution | None = None) -> di
     independently to each feature (``Laplace(0, 1 / beta)`` has its mode at the L1 penalty of the relaxed
     maximum-entropy program); one over ``K`` numbers is returned as it is. Raises ``ValueError`` for any other
     shape.
+
+    See Also
+    --------
+    i2rl.models.occlusion_model : a model with this prior
+
+    Examples
+    --------
+    >>> import numpyro.distributions as dist
+    >>> from i2rl.models import weights_prior
+    >>> weights_prior(6).event_shape
+    (6,)
+    >>> weights_prior(6, dist.Laplace(0, 1)).event_shape  # one distribution for each feature
+    (6,)
     """
     if prior is None:
         prior = dist.Normal(0.0, PRIOR_SCALE)
@@ -140,6 +153,23 @@ def occlusion_model(
     Returns
     -------
     The site ``demonstration``; the other site is ``weights [K]`` and the plate is ``trajectory``.
+
+    See Also
+    --------
+    i2rl.inference.sample_posterior : NUTS for this model
+    i2rl.models.weights_prior : the prior
+    i2rl.models.TrajectoryLaw : the distribution of one trajectory
+
+    Examples
+    --------
+    >>> import jax
+    >>> from numpyro.infer import Predictive
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import occlusion_model
+    >>> corridor, simulate = five_cells(), Predictive(occlusion_model, num_samples=10)
+    >>> draws = simulate(jax.random.key(0), corridor.mdp, corridor.sensor, n_trajectories=8, length=6)
+    >>> draws["weights"].shape, draws["demonstration"].shape
+    ((10, 2), (10, 8, 6, 3))
     """
     if codes is not None:
         n_trajectories, length = codes.shape[0], codes.shape[1]

@@ -127,5 +127,22 @@ class TrajectoryLaw(dist.Distribution):
 
 
 def sample_demonstration(key: Array, law: TrajectoryLaw, n_trajectories: int) -> Demonstration:
-    """Simulate a demonstration of independent trajectories."""
+    """Simulate a demonstration of independent trajectories.
+
+    See Also
+    --------
+    i2rl.models.TrajectoryLaw : the distribution that is drawn from
+    i2rl.models.simulate : draws one trajectory, all of it seen
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import TrajectoryLaw, sample_demonstration
+    >>> corridor = five_cells()
+    >>> law = TrajectoryLaw(corridor.mdp, corridor.weights, corridor.sensor, 6)
+    >>> demonstration = sample_demonstration(jax.random.key(1), law, 8)
+    >>> demonstration.lengths.tolist(), demonstration.state[:, 0].tolist()  # all begin in cell 0
+    ([6, 6, 6, 6, 6, 6, 6, 6], [0, 0, 0, 0, 0, 0, 0, 0])
+    """
     return Demonstration.from_codes(np.asarray(law.sample(key, (n_trajectories,))))

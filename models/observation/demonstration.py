@@ -275,7 +275,21 @@ class Demonstration:
 
 
 def concatenate(demonstrations: Sequence[Demonstration]) -> Demonstration:
-    """Concatenate the trajectories of several demonstrations, padded to the longest."""
+    """Concatenate the trajectories of several demonstrations, padded to the longest.
+
+    See Also
+    --------
+    i2rl.models.Demonstration : its methods select, cut and pad trajectories
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import concatenate
+    >>> demonstration = five_cells().demonstration  # eight trajectories of six steps
+    >>> first, second = demonstration.select([0, 1, 2]), demonstration.select([3]).fragments(3)
+    >>> concatenate([first, second]).lengths.tolist()
+    [6, 6, 6, 3, 3]
+    """
     if not demonstrations:
         raise ValueError("nothing to concatenate")
     width = max(d.kind.shape[1] for d in demonstrations)
@@ -655,6 +669,20 @@ def read_trajectories(
     the number of the first line, for a reader that starts midway. ``limits`` bounds the size and steps of a
     line, and thereby the memory that reading it takes. Raises :class:`DemonstrationError` naming ``source``,
     line and step.
+
+    See Also
+    --------
+    i2rl.models.write_trajectories : writes the same format
+    i2rl.models.Demonstration : its from_arrays takes arrays
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import read_trajectories
+    >>> lines = ['{"id": "walk", "steps": [{"s": "cell 0", "a": "right"}, "hidden", null]}']
+    >>> [record] = read_trajectories(lines, five_cells().mdp)
+    >>> record.id, record.demonstration.kind.tolist()  # 1 is seen, 2 hidden, 3 lost
+    ('walk', [[1, 2, 3]])
     """
     names = _Names(mdp)
     for number, where, content in parsed_lines(lines, source, first_line, limits):
@@ -726,6 +754,19 @@ def write_trajectories(
     for every row; ``ValueError`` if not, ``TypeError`` for other entries. Raises :class:`DemonstrationError`
     naming trajectory and step for steps that could not be read back: states and actions that the MDP lacks, a
     seen step without either, a score outside [0, 1].
+
+    See Also
+    --------
+    i2rl.models.read_trajectories : reads the same format
+
+    Examples
+    --------
+    >>> import sys
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import Demonstration, write_trajectories
+    >>> walk = Demonstration.from_arrays([[0, -1]], [[1, -1]], missing=-1)
+    >>> write_trajectories(sys.stdout, walk, five_cells().mdp, ids=["walk"])
+    {"id": "walk", "steps": [{"s": "cell 0", "a": "right"}, "hidden"]}
     """
     if not hasattr(file, "write"):
         raise TypeError(f"file must be a file open for writing text; got {shortened(file)}")

@@ -548,6 +548,21 @@ def log_evidence(sensor: AnySensor, mdp: TabularMDP, demonstration: Demonstratio
 
     Raises ``ValueError`` for a sensor whose number of states or actions differs, and as
     :func:`checked_demonstration` does.
+
+    See Also
+    --------
+    i2rl.models.Sensor : sensors and their products
+    i2rl.inference.expectations : completes a demonstration by its evidence
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import Demonstration, log_evidence
+    >>> corridor = five_cells()
+    >>> walk = Demonstration.from_arrays([[1, -1]], [[1, -1]], missing=-1)  # the second step is hidden
+    >>> print(np.exp(log_evidence(corridor.sensor, corridor.mdp, walk)[0, 1]).max(axis=1))  # cell 2 or cell 3
+    [0. 0. 1. 1. 0.]
     """
     sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
     step = jax.vmap(jax.vmap(lambda *x: step_log_evidence(sensor, mdp.n_states, mdp.n_actions, *x)))
@@ -558,7 +573,25 @@ def log_evidence(sensor: AnySensor, mdp: TabularMDP, demonstration: Demonstratio
 def observe(
     key: Array, sensor: AnySensor, states: Int[Array, " L"], actions: Int[Array, " L"]
 ) -> Int[Array, "L 3"]:
-    """Pass a true trajectory through a sensor; return codes (kind, state, action) of the observations."""
+    """Pass a true trajectory through a sensor; return codes (kind, state, action) of the observations.
+
+    See Also
+    --------
+    i2rl.models.sample_demonstration : simulates trajectories and observes them
+    i2rl.models.distort : the same for recordings
+
+    Examples
+    --------
+    >>> import jax
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import Demonstration, observe
+    >>> codes = observe(jax.random.key(0), five_cells().sensor, np.array([0, 1, 2]), np.array([1, 1, 1]))
+    >>> codes.tolist()  # cell 2 is out of view: kind 2 is hidden, -1 is unknown
+    [[1, 0, 1], [1, 1, 1], [2, -1, -1]]
+    >>> Demonstration.from_codes(codes[None]).state.tolist()
+    [[0, 1, -1]]
+    """
 
     sensor = as_sensor(sensor)
 
@@ -586,6 +619,22 @@ def require_possible(
 
     The check propagates the set of possible states; ``record`` names a row in messages. An index out of range
     is such a step too.
+
+    See Also
+    --------
+    i2rl.models.log_evidence : the evidence of every step
+    i2rl.models.DemonstrationError : the error
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import Demonstration, DemonstrationError, require_possible
+    >>> corridor, jump = five_cells(), Demonstration.from_pairs([[0, 4]], [[1, 1]])
+    >>> try:
+    ...     require_possible(corridor.sensor, corridor.mdp, jump)
+    ... except DemonstrationError as error:
+    ...     print(error)
+    trajectory 0, step 1: ...
     """
     sensor = fitting_sensor(sensor, mdp)
     demonstration = checked_demonstration(mdp, demonstration, record=record)

@@ -110,6 +110,21 @@ def recording(
 
     Raises :class:`RecordingError` naming the trajectory, and the step if there is one: numbers that are
     not finite, shapes that do not fit each other, fewer than two steps, numbered actions out of range.
+
+    See Also
+    --------
+    i2rl.models.distort : passes a recording through a sensor
+    i2rl.models.Demonstration : trajectories of states and actions that are numbered
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.models import recording
+    >>> trajectories = recording([np.zeros((5, 4)), np.zeros((3, 4))], [np.zeros(5, int), np.zeros(3, int)])
+    >>> trajectories.observations.shape, trajectories.actions.shape
+    ((2, 5, 4), (2, 5))
+    >>> trajectories.lengths.tolist()
+    [5, 3]
     """
     if len(observations) == 0 or len(observations) != len(actions):
         raise RecordingError(
@@ -261,7 +276,24 @@ def require_continuous(sensor: Any) -> None:
 
 
 def distort(key: Array, sensor: ContinuousSensor, truth: Recording) -> Recording:
-    """Replace a recording by the sensor's observations of it; padding is unchanged."""
+    """Replace a recording by the sensor's observations of it; padding is unchanged.
+
+    See Also
+    --------
+    i2rl.models.GaussianSensor : Gaussian noise of given covariances
+    i2rl.models.ShiftSensor : shifted states and replaced actions
+    i2rl.models.observe : the same for states and actions that are numbered
+
+    Examples
+    --------
+    >>> import jax
+    >>> import numpy as np
+    >>> from i2rl.models import GaussianSensor, distort, recording
+    >>> truth = recording([np.zeros((2000, 2))], [np.zeros((2000, 1))])
+    >>> reported = distort(jax.random.key(0), GaussianSensor(0.04, 0.01), truth)  # variances
+    >>> round(float(reported.observations.std()), 1), round(float(reported.actions.std()), 1)
+    (0.2, 0.1)
+    """
     require_continuous(sensor)
     observations, actions = sensor.sample(as_key(key), truth.observations, truth.actions)
     live = truth.live[..., None]

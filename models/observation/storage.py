@@ -44,6 +44,22 @@ def save_mdp(path: str | os.PathLike[str], mdp: TabularMDP, in_view: np.ndarray 
     ``states``, ``actions`` and ``feature_names`` hold names if there are any. Raises ``ValueError`` for a
     path that does not end in ``.npz`` (NumPy would add it), visibility of the wrong shape or outside [0, 1],
     and names that end in a NUL character (NumPy would drop it).
+
+    See Also
+    --------
+    i2rl.models.load_mdp : reads the file
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import load_mdp, save_mdp
+    >>> corridor = five_cells()
+    >>> with TemporaryDirectory() as folder:
+    ...     save_mdp(f"{folder}/corridor.npz", corridor.mdp, corridor.sensor.in_view)
+    ...     stored = load_mdp(f"{folder}/corridor.npz")
+    >>> stored.in_view.tolist()
+    [1.0, 1.0, 0.0, 0.0, 1.0]
     """
     if not isinstance(mdp, TabularMDP):
         raise TypeError(f"mdp must be a TabularMDP; got {shortened(mdp)}")
@@ -71,6 +87,22 @@ def load_mdp(path: str | os.PathLike[str], *, max_bytes: int = MAX_BYTES) -> Sto
     headers before they are read, and may take ``max_bytes`` in all (1 GiB by default); building the process
     takes about three times their size. Raises :class:`StorageError` (a ``ValueError``) naming the file and
     the fault, and ``OSError`` if the file cannot be opened.
+
+    See Also
+    --------
+    i2rl.models.save_mdp : writes the file
+    i2rl.models.TabularMDP : its from_successors takes the same arrays
+
+    Examples
+    --------
+    >>> from tempfile import TemporaryDirectory
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import load_mdp, save_mdp
+    >>> with TemporaryDirectory() as folder:
+    ...     save_mdp(f"{folder}/corridor.npz", five_cells().mdp)
+    ...     stored = load_mdp(f"{folder}/corridor.npz")
+    >>> stored.mdp.n_states, stored.mdp.feature_names, stored.in_view
+    (5, ('at the end', 'moves'), None)
     """
     arrays = read_arrays(path, _KINDS, required=_ARRAYS[:3], what="MDP archive", max_bytes=max_bytes)
     try:

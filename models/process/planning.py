@@ -84,7 +84,21 @@ class HardPlan(NamedTuple):
 
 
 def reward_of(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
-    """Return the reward ``theta . phi(s, a)`` of every pair. Raises ``ValueError`` for a weight of NaN."""
+    """Return the reward ``theta . phi(s, a)`` of every pair. Raises ``ValueError`` for a weight of NaN.
+
+    See Also
+    --------
+    i2rl.models.soft_plan : the behaviour that a reward explains
+    i2rl.models.hard_plan : the behaviour that is best under it
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import reward_of
+    >>> corridor = five_cells()
+    >>> print(reward_of(corridor.mdp, corridor.weights)[4].round(1))  # at the end: left, right, stay
+    [1.8 1.8 2. ]
+    """
     if not is_traced(weights) and np.isnan(np.asarray(weights)).any():
         k = int(np.argwhere(np.isnan(np.asarray(weights)))[0, 0])
         raise ValueError(
@@ -131,6 +145,21 @@ def soft_plan(
     ``DIRECT_LIMIT`` states and Krylov solves beyond. Its precision is about 1e-12 of the values' scale, or
     rounding if the discount is above 0.99. Raises ``ValueError`` for discount 1 and a reward of NaN; in a
     traced reward, NaN makes the whole plan NaN.
+
+    See Also
+    --------
+    i2rl.models.hard_plan : the plan of a deterministic expert
+    i2rl.models.finite_soft_plan : the plan over a finite horizon
+    i2rl.models.reward_of : the reward of weights
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import reward_of, soft_plan
+    >>> corridor = five_cells()
+    >>> plan = soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights))
+    >>> print(plan.policy[0].round(1))  # in cell 0: left, right, stay
+    [0.2 0.7 0.2]
     """
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
@@ -178,6 +207,20 @@ def hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: float = 1
     ``tolerance`` is relative to the spread of the values. Policy iteration, with direct solves up to
     ``DIRECT_LIMIT`` states and Krylov solves beyond. Raises ``ValueError`` for discount 1 and a reward of
     NaN; in a traced reward, NaN makes all values NaN and no action optimal.
+
+    See Also
+    --------
+    i2rl.models.soft_plan : the plan of a stochastic expert
+    i2rl.models.deterministic_policy : a policy that takes one optimal action
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import hard_plan, reward_of
+    >>> corridor = five_cells()
+    >>> plan = hard_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights))
+    >>> print(plan.values.round(1), plan.optimal[0])  # in cell 0 only "right" is optimal
+    [11.8 13.5 15.4 17.6 20. ] [False  True False]
     """
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
@@ -209,7 +252,21 @@ def greedy_actions(q: Float[Array, "S A"], tolerance: float | Array = 1e-9) -> B
 
 
 def deterministic_policy(optimal: Bool[Array, "S A"]) -> Float[Array, "S A"]:
-    """Return the policy of the first optimal action of each state; NaN if a state has none."""
+    """Return the policy of the first optimal action of each state; NaN if a state has none.
+
+    See Also
+    --------
+    i2rl.models.hard_plan : finds the optimal actions
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import deterministic_policy, hard_plan, reward_of
+    >>> corridor = five_cells()
+    >>> plan = hard_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights))
+    >>> deterministic_policy(plan.optimal).argmax(axis=1).tolist()  # to the right, and at the end stay
+    [1, 1, 1, 1, 2]
+    """
     first = jax.nn.one_hot(jnp.argmax(optimal, axis=1), optimal.shape[1])
     return jnp.where(jnp.any(optimal, axis=1, keepdims=True), first, jnp.nan)
 
@@ -415,7 +472,23 @@ def _by_column(function: Callable[[Float[Array, " S"]], Float[Array, " S"]], x: 
 def policy_values(
     mdp: TabularMDP, policy: Float[Array, "S A"], reward: Float[Array, "S A"]
 ) -> Float[Array, " S"]:
-    """Return the exact discounted values ``V^pi(s)`` of a policy under a reward."""
+    """Return the exact discounted values ``V^pi(s)`` of a policy under a reward.
+
+    See Also
+    --------
+    i2rl.models.hard_plan : the greatest values
+    i2rl.models.occupancy : the visits of a policy
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import policy_values, reward_of
+    >>> corridor = five_cells()
+    >>> uniform = np.full((5, 3), 1 / 3)
+    >>> print(policy_values(corridor.mdp, uniform, reward_of(corridor.mdp, corridor.weights)).round(1))
+    [-0.1  0.4  1.5  3.7  7.7]
+    """
     require_discounted(mdp)
     _require_numbers(mdp, "reward", reward)
     _require_numbers(mdp, "policy", policy)
@@ -444,7 +517,23 @@ def _features_to_go(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array
 def occupancy(
     mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, "S A"]:
-    """Return the occupancy ``x(s, a) = sum_t gamma^t P(s_t = s, a_t = a)``, of sum ``1 / (1 - gamma)``."""
+    """Return the occupancy ``x(s, a) = sum_t gamma^t P(s_t = s, a_t = a)``, of sum ``1 / (1 - gamma)``.
+
+    See Also
+    --------
+    i2rl.models.feature_expectations : the features that these visits collect
+    i2rl.models.simulate : draws a trajectory
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import occupancy, reward_of, soft_plan
+    >>> corridor = five_cells()
+    >>> policy = soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights)).policy
+    >>> visits = occupancy(corridor.mdp, policy).sum(axis=1)
+    >>> print(visits.round(1), visits.sum().round(1))  # 1 / (1 - discount) visits in all
+    [1.6 1.1 0.9 1.  5.4] 10.0
+    """
     require_discounted(mdp)
     _require_numbers(mdp, "policy", policy)
     return _occupancy(mdp, policy, initial)
@@ -463,7 +552,22 @@ def _occupancy(
 def feature_expectations(
     mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
 ) -> Float[Array, " K"]:
-    """Return the expected discounted features ``E_X[phi_k]`` of a policy."""
+    """Return the expected discounted features ``E_X[phi_k]`` of a policy.
+
+    See Also
+    --------
+    i2rl.models.occupancy : discounted visits of every pair
+    i2rl.inference.solve_dual : finds weights that match expected features
+
+    Examples
+    --------
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import feature_expectations, reward_of, soft_plan
+    >>> corridor = five_cells()
+    >>> policy = soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights)).policy
+    >>> print(feature_expectations(corridor.mdp, policy).round(1))  # discounted steps at the end, and moves
+    [5.4 6.5]
+    """
     require_discounted(mdp)
     _require_numbers(mdp, "policy", policy)
     return _feature_expectations(mdp, policy, initial)
@@ -509,7 +613,25 @@ class FinitePlan(NamedTuple):
 
 
 def finite_soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int) -> FinitePlan:
-    """Plan softly over ``horizon`` steps in one backward pass; any discount in (0, 1]."""
+    """Plan softly over ``horizon`` steps in one backward pass; any discount in (0, 1].
+
+    See Also
+    --------
+    i2rl.models.soft_plan : the plan over an infinite horizon
+    i2rl.inference.fit_weights : learns weights over a finite horizon
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import finite_soft_plan, reward_of
+    >>> corridor = five_cells()
+    >>> plan = finite_soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights), horizon=3)
+    >>> print(np.exp(plan.log_policy[:, 3]).round(1))  # cell 3: in the last step a move does not pay any more
+    [[0.  0.8 0.1]
+     [0.1 0.7 0.2]
+     [0.3 0.3 0.4]]
+    """
     _require_numbers(mdp, "reward", reward)
     return _finite_soft_plan(mdp, reward, horizon=horizon)
 
@@ -584,7 +706,24 @@ def simulate(
     length: int,
     first: Int[Array, ""] | None = None,
 ) -> tuple[Int[Array, " T"], Int[Array, " T"]]:
-    """Draw one trajectory of ``length`` pairs (states, actions) under a policy, from ``first`` or ``p0``."""
+    """Draw one trajectory of ``length`` pairs (states, actions) under a policy, from ``first`` or ``p0``.
+
+    See Also
+    --------
+    i2rl.models.sample_demonstration : simulates trajectories and observes them
+    i2rl.models.observe : passes a trajectory through a sensor
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import reward_of, simulate, soft_plan
+    >>> corridor = five_cells()
+    >>> plan = soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights))
+    >>> states, actions = simulate(jax.random.key(0), corridor.mdp, plan.log_policy, 6)
+    >>> int(states[0]), actions.shape
+    (0, (6,))
+    """
     _require_numbers(mdp, "log-policy", log_policy)
     return _simulate(as_key(key), mdp, log_policy, first, length=length)
 
