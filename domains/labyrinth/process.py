@@ -148,7 +148,22 @@ def maze_positions() -> Float[np.ndarray, "127+1 2"]:
 
 @cache
 def mouse_labyrinth(discount: float = 0.9) -> Labyrinth:
-    """Build the labyrinth. Raises ``ValueError`` for a discount outside (0, 1]."""
+    """Build the labyrinth. Raises ``ValueError`` for a discount outside (0, 1].
+
+    See Also
+    --------
+    i2rl.domains.simulate_bouts : simulate a mouse
+    i2rl.domains.read_bouts : read a recorded one
+
+    Examples
+    --------
+    >>> from i2rl.domains import mouse_labyrinth
+    >>> maze = mouse_labyrinth()
+    >>> maze.mdp.n_states, maze.mdp.n_actions, int(maze.choice.sum())
+    (254, 3, 189)
+    >>> int((maze.without_left_half().visibility == 0).sum())
+    125
+    """
     return _build(discount, (*SHARED_FEATURES, *_NODE_FEATURES), _features)
 
 
@@ -260,6 +275,19 @@ def read_bouts(
     parent or to a child; home may only be the last node. A bout that does not end at home is accepted: the
     recording stopped while the animal was inside. ``limits`` bounds the characters and nodes of a line.
     Raises :class:`DemonstrationError` naming ``source``, line and position in ``nodes``.
+
+    See Also
+    --------
+    i2rl.domains.demonstration_of : make trajectories of bouts
+    i2rl.domains.simulate_bouts : bouts without a recording
+    i2rl.analysis.labyrinth_study : learn from a recording
+
+    Examples
+    --------
+    >>> from i2rl.domains import read_bouts
+    >>> first, second = read_bouts(['{"id": "a", "nodes": [0, 2, 0, 127]}', '{"nodes": [0, 1, 4]}'])
+    >>> first.id, first.nodes, second.nodes
+    ('a', (0, 2, 0, 127), (0, 1, 4))
     """
     for _, where, content in parsed_lines(lines, source, limits=limits):
         if not isinstance(content, dict) or not isinstance(content.get("nodes"), list):
@@ -339,7 +367,23 @@ def nodes_of(
 
 
 def demonstration_of(maze: Labyrinth, bouts: Sequence[Bout]) -> Demonstration:
-    """Return bouts as fully observed trajectories, one a row; ``ValueError`` if there are none."""
+    """Return bouts as fully observed trajectories, one a row; ``ValueError`` if there are none.
+
+    See Also
+    --------
+    i2rl.domains.read_bouts : read bouts
+    i2rl.domains.mouse_labyrinth : the maze they are in
+
+    Examples
+    --------
+    >>> from i2rl.domains import Bout, demonstration_of, mouse_labyrinth
+    >>> maze = mouse_labyrinth()
+    >>> demonstration = demonstration_of(maze, [Bout("a", (0, 2, 0, 127)), Bout("b", (0, 1, 4))])
+    >>> demonstration.lengths.tolist()
+    [3, 2]
+    >>> [maze.mdp.action_names[a] for a in demonstration.action[0]]
+    ['right', 'back', 'back']
+    """
     return concatenate([Demonstration.from_pairs(*pairs_of(maze, bout.nodes)) for bout in bouts])
 
 
@@ -373,6 +417,20 @@ def simulate_bouts(
     """Simulate bouts of a mouse that follows the soft policy of ``weights [K]``.
 
     A bout that has not come home after ``max_steps`` steps is cut off there, as by the end of a recording.
+
+    See Also
+    --------
+    i2rl.domains.demonstration_of : make trajectories of bouts
+    i2rl.analysis.labyrinth_study : learn from them
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import mouse_labyrinth, simulate_bouts
+    >>> maze = mouse_labyrinth()
+    >>> bouts = simulate_bouts(jax.random.key(0), maze, jax.numpy.zeros(maze.mdp.n_features), 3, max_steps=64)
+    >>> len(bouts), bouts[0].id, bouts[0].nodes[0]
+    (3, 'simulated-0', 0)
     """
     states, actions = (np.asarray(x) for x in _simulate(key, maze.mdp, jnp.asarray(weights), n, max_steps))
     bouts = []

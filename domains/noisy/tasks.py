@@ -200,6 +200,21 @@ def noisy_sorting(
     ``pick_inspect_place()`` the opposite of every known prediction exists; in another ``sorting`` it may be
     no state of the process; the prediction is then observed correctly. The natural start is an unknown onion
     on the table. Raises ``ValueError`` for noise outside [0, 1].
+
+    See Also
+    --------
+    i2rl.domains.demonstrate_noisy : simulate its expert
+    i2rl.domains.pick_inspect_place : its process
+    i2rl.domains.noisy_patrol : the other task
+
+    Examples
+    --------
+    >>> from i2rl.domains import noisy_sorting
+    >>> task = noisy_sorting(prediction_noise=0.2, place_noise=0.1)
+    >>> task.mdp.n_states, task.predicates.shape
+    (22, (8, 22, 7))
+    >>> task.noise.chances.tolist()
+    [0.2, 0.1]
     """
     sorting = onions.pick_inspect_place() if sorting is None else sorting
     index = {tuple(row): s for s, row in enumerate(np.asarray(sorting.factors).tolist())}
@@ -230,6 +245,21 @@ def noisy_patrol(noise: float = SWAP) -> NoisyTask:
 
     The sensor observes its place, left turns and stops correctly. The natural start is somewhere on its loop
     (the stationary distribution of its policy). Raises ``ValueError`` for noise outside [0, 1].
+
+    See Also
+    --------
+    i2rl.domains.demonstrate_noisy : simulate its expert
+    i2rl.domains.noisy_sorting : the other task
+
+    Examples
+    --------
+    >>> from i2rl.domains import noisy_patrol
+    >>> task = noisy_patrol()
+    >>> task.predicates.shape, task.label_names
+    ((4, 124, 4), ('state',))
+    >>> sharper = noisy_patrol(0.1)
+    >>> sharper.noise.chances.tolist()
+    [0.1]
     """
     patrol = patrols.instance(2)
     policy = patrol.expert_policy()
@@ -393,6 +423,23 @@ def demonstrate_noisy(
 
     Raises ``ValueError`` for other words, sizes below one, a concentration or reliabilities that are none,
     and noise or visibility for another number of states or actions.
+
+    See Also
+    --------
+    i2rl.domains.noisy_sorting : a task with noise
+    i2rl.domains.noisy_patrol : another
+    i2rl.inference.rimeo : learn from reports and their noise
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import demonstrate_noisy, noisy_sorting
+    >>> noisy = demonstrate_noisy(jax.random.key(0), noisy_sorting(), sessions=10, scores="calibrated")
+    >>> noisy.seen.n_trajectories, noisy.seen.score.shape
+    (20, (20, 3))
+    >>> wrong = (noisy.seen.state != noisy.truth.state) | (noisy.seen.action != noisy.truth.action)
+    >>> bool(wrong.any()), bool(wrong.all())
+    (True, False)
     """
     scores, concentration, reliabilities = Scoring(**scoring)
     if min(sessions, trajectories, steps) < 1:

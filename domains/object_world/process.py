@@ -87,6 +87,21 @@ def random_object_world(
 
     Raises ``ValueError`` for a size below 2, a number of walls that leaves less than two cells besides the
     objects' or is negative, and where no connected layout turns up in 10 000 draws.
+
+    See Also
+    --------
+    i2rl.analysis.label_bias_study : a study of many worlds
+    i2rl.domains.five_cells : a smaller process
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import random_object_world
+    >>> world = random_object_world(jax.random.key(0), size=6, walls=5)
+    >>> world.mdp.n_states, int(world.walls.sum()), world.objects
+    (31, 5, ((0, 0), (5, 5)))
+    >>> world.state_of((5, 5))
+    30
     """
     if size < 2:
         raise ValueError(f"an object world needs at least 2 x 2 cells, got size {size}")

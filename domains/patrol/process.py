@@ -175,6 +175,21 @@ def simulate_patrol(
 
     Two patrollers meet when they share a cell or one stands where the other just was. A waiting patroller
     is recorded as stopping.
+
+    See Also
+    --------
+    i2rl.domains.demonstrate : the same, seen by a learner
+    i2rl.models.simulate : walk a process alone
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import instance, simulate_patrol
+    >>> patrol = instance(2)
+    >>> policies = jax.numpy.log(jax.numpy.stack([patrol.expert_policy()] * 2))
+    >>> states, actions = simulate_patrol(jax.random.key(0), patrol, policies, [0, 60], 10)
+    >>> states.shape, actions.shape
+    ((2, 10), (2, 10))
     """
     cells = jnp.asarray(patrol.cell_of_state)
     return simulate_patrollers(
@@ -241,6 +256,19 @@ def demonstrate(
     The patrollers start in states drawn from the MDP's initial distribution and follow their optimal
     policies. Row ``i`` of each demonstration is session ``i`` (section 7.4.1: five pairs a session). An
     ``observability`` of None is the instance's own.
+
+    See Also
+    --------
+    i2rl.domains.simulate_patrol : the states and actions behind it
+    i2rl.inference.lme_i2rl : learn from it
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import demonstrate, instance
+    >>> first, second = demonstrate(jax.random.key(0), instance(2), 30, sessions=4)
+    >>> first.n_trajectories, first.lengths.tolist()
+    (4, [5, 5, 5, 5])
     """
     policy = jnp.log(jnp.asarray(patrol.expert_policy()))
     first, walk, look = jax.random.split(key, 3)
@@ -352,6 +380,20 @@ def four_hallways() -> Patrol:
     The released map has 200 states; this reconstruction shortens its corridor by one cell, which gives the
     192 of the dissertation (25 cells in four phases of 13, 11, 13 and 11). A feature fires on the step that
     lands on the end of the next hallway, as appendix C's list defines it.
+
+    See Also
+    --------
+    i2rl.domains.instance : the patrols by number
+    i2rl.domains.boyd_fifth_floor : a patrol that can be breached
+
+    Examples
+    --------
+    >>> from i2rl.domains import four_hallways
+    >>> patrol = four_hallways()
+    >>> patrol.mdp.n_states, patrol.patrollers, patrol.breach is None
+    (192, 1, True)
+    >>> patrol.mdp.feature_names[0]
+    'switch to hallway 1'
     """
     corridor = [(r, 4) for r in range(9)]
     rows = {1: 5, 2: 0, 3: 3, 4: 8}
@@ -397,6 +439,20 @@ def boyd_fifth_floor() -> Patrol:
 
     The intended move succeeds with probability 0.95. Turning features overlap as in the released code:
     cells (1,1) and (15,1) belong to hallway and corner, (0,2) and (16,2) to corner and first division.
+
+    See Also
+    --------
+    i2rl.domains.instance : the patrols by number
+    i2rl.domains.demonstrate : what a learner sees of one
+
+    Examples
+    --------
+    >>> from i2rl.domains import boyd_fifth_floor
+    >>> patrol = boyd_fifth_floor()
+    >>> patrol.mdp.n_states, patrol.patrollers, patrol.observability
+    (124, 2, 30)
+    >>> sorted(patrol.views)
+    [11, 18, 30, 41, 70, 100]
     """
     cells = frozenset(
         [(0, c) for c in range(1, 9)] + [(r, 1) for r in range(1, 16)] + [(16, c) for c in range(1, 9)]
@@ -456,6 +512,20 @@ def boyd_with_rooms() -> Patrol:
     Two limits on what can be learned here. The features span a potential-based shaping (potential: being in a
     room), so one direction of weights changes no behaviour and no data identifies it. The patrollers never
     enter a room, so their policy inside, in 56 of the 184 states, is an extrapolation.
+
+    See Also
+    --------
+    i2rl.domains.instance : the patrols by number
+    i2rl.domains.boyd_fifth_floor : the hallway without rooms
+
+    Examples
+    --------
+    >>> from i2rl.domains import boyd_with_rooms
+    >>> patrol = boyd_with_rooms()
+    >>> patrol.mdp.n_states, patrol.patrollers, patrol.observability
+    (184, 2, 18)
+    >>> patrol.mdp.feature_names[:2]
+    ('moves', 'in a room')
     """
     first_room = [(r, 10) for r in range(1, 6)] + [(2, c) for c in range(4, 10)]
     second_room = [(5, c) for c in range(13, 16)]
@@ -523,7 +593,24 @@ def boyd_with_rooms() -> Patrol:
 
 
 def instance(number: int) -> Patrol:
-    """Build patrol instance 1, 2 or 3."""
+    """Build patrol instance 1, 2 or 3.
+
+    See Also
+    --------
+    i2rl.domains.four_hallways : instance 1
+    i2rl.domains.boyd_fifth_floor : instance 2
+    i2rl.domains.boyd_with_rooms : instance 3
+
+    Examples
+    --------
+    >>> from i2rl.domains import instance
+    >>> patrol = instance(2)
+    >>> patrol.mdp.n_states, patrol.mdp.n_actions, patrol.mdp.n_features
+    (124, 4, 6)
+    >>> view = patrol.visibility(30)
+    >>> int((view.visibility > 0).sum())
+    32
+    """
     builders = {1: four_hallways, 2: boyd_fifth_floor, 3: boyd_with_rooms}
     if number not in builders:
         raise ValueError(f"patrol instances are 1, 2 and 3, got {number}")

@@ -209,6 +209,22 @@ def breach_trials(
     ValueError
         For an instance without a breach, an unknown observability, policies of another shape, or learning
         times that are negative or not one per trial.
+
+    See Also
+    --------
+    i2rl.domains.demonstrate : what the policies are learned from
+    i2rl.analysis.patrol_study : learn and breach in one
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import breach_trials, instance
+    >>> patrol = instance(2)
+    >>> known = jax.numpy.log(jax.numpy.stack([patrol.expert_policy()] * 2))
+    >>> options = dict(observability=30, observed_steps=10, trials=5)
+    >>> outcome = breach_trials(jax.random.key(0), patrol, known, **options)
+    >>> outcome.threshold, outcome.rate() > 0.5
+    (244.0, True)
     """
     world = breach_task(patrol, settings.reach)
     observability, observed_steps, learning_seconds, threshold = watching

@@ -38,6 +38,22 @@ def cart_pole(horizon: int = 500) -> Environment:
 
     Observations are the cart's position (m) and velocity (m/s), the pole's angle (rad) and its velocity
     (rad/s). An episode terminates beyond 2.4 m or 12 degrees.
+
+    See Also
+    --------
+    i2rl.domains.mountain_car : another task
+    i2rl.inference.ppo : learn to act in it
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import cart_pole
+    >>> task = cart_pole()
+    >>> task.observation_size, task.actions.n, task.horizon
+    (4, 2, 500)
+    >>> state, reward, terminated = task.step(task.reset(jax.random.key(0)), 1)
+    >>> float(reward), bool(terminated)
+    (1.0, False)
     """
     wide = (2 * _FURTHEST, math.inf, 2 * _STEEPEST, math.inf)
     return Environment(
@@ -59,6 +75,22 @@ def mountain_car(horizon: int = 200) -> Environment:
 
     Observations are the position, in [-1.2, 0.6], and the velocity, in [-0.07, 0.07] a step. An episode
     terminates at a position of 0.5 or more that is not left again.
+
+    See Also
+    --------
+    i2rl.domains.cart_pole : another task
+    i2rl.domains.load_expert : its expert
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import mountain_car
+    >>> task = mountain_car()
+    >>> task.observation_size, task.actions.n, task.horizon
+    (2, 3, 200)
+    >>> state, reward, terminated = task.step(task.reset(jax.random.key(0)), 2)
+    >>> float(reward), bool(terminated)
+    (-1.0, False)
     """
     return Environment(
         name="mountain-car",

@@ -169,6 +169,20 @@ def load_demonstrations(name: str) -> Demonstrations:
 
     Raises ``ValueError`` for a name that is not in :data:`EXPERTS`, and :class:`StorageError` (a
     ``ValueError``) naming a file that holds something else.
+
+    See Also
+    --------
+    i2rl.domains.load_expert : the expert who was recorded
+    i2rl.inference.airl : learn from the recording
+
+    Examples
+    --------
+    >>> from i2rl.domains import load_demonstrations
+    >>> episodes = load_demonstrations("mountain-car")
+    >>> episodes.observations.shape[0], episodes.observations.shape[2]
+    (40, 2)
+    >>> bool(episodes.terminated.all()), round(float(episodes.returns.mean()), -1)
+    (True, -110.0)
     """
     path = FOLDER / f"{_known(name)}-demonstrations.npz"
     arrays = read_arrays(path, _EPISODES, required=tuple(_EPISODES), what="archive of demonstrations")
@@ -185,7 +199,22 @@ def load_demonstrations(name: str) -> Demonstrations:
 
 
 def load_expert(name: str) -> Policy:
-    """Load the stored policy of an expert. Raises as :func:`load_demonstrations`."""
+    """Load the stored policy of an expert. Raises as :func:`load_demonstrations`.
+
+    See Also
+    --------
+    i2rl.domains.load_demonstrations : what it was recorded doing
+    i2rl.domains.mountain_car : its task
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> from i2rl.domains import load_expert
+    >>> expert = load_expert("mountain-car")
+    >>> rolling_left, rolling_right = [-0.6, -0.03], [-0.5, 0.03]
+    >>> expert.mode(jnp.array([rolling_left, rolling_right])).tolist()
+    [0, 2]
+    """
     task, facts = expert_task(name), load_facts(name)
     template = jax.eval_shape(
         lambda key: policy_network(key, task.observation_size, task.actions, facts["settings"]["hidden"]),

@@ -31,6 +31,23 @@ def read_onion_recordings(folder: Path | str, stride: float = STRIDE) -> Recordi
     any, and naming file, row and column (from 1) for: a row of another length, what is not a finite number, a
     label that is none, an action that does not lead to the next wrist or is longer than ``stride`` along an
     axis, states and actions that are not equally many.
+
+    See Also
+    --------
+    i2rl.domains.write_onion_recordings : write the files
+    i2rl.domains.onion_reaching : the task that is recorded
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import jax
+    >>> from i2rl.domains import read_onion_recordings, write_onion_recordings
+    >>> from i2rl.domains.robots.reaching import demonstrate_onions
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     paths = write_onion_recordings(folder, demonstrate_onions(jax.random.key(0), 2))
+    ...     recorded = read_onion_recordings(folder)
+    >>> len(recorded.lengths), recorded.observations.shape[2]
+    (2, 29)
     """
     folder = Path(folder)
     found = [match[1] for path in folder.glob("states_*.csv") if (match := _NUMBERED.fullmatch(path.name))]
@@ -55,6 +72,22 @@ def write_onion_recordings(
     """Write trajectories of the task in the same layout, two decimals; return the paths of the states.
 
     The state after the last step is the last row, with the action zero.
+
+    See Also
+    --------
+    i2rl.domains.read_onion_recordings : read the files
+    i2rl.domains.onion_reaching : the task that is recorded
+
+    Examples
+    --------
+    >>> import tempfile
+    >>> import jax
+    >>> from i2rl.domains import write_onion_recordings
+    >>> from i2rl.domains.robots.reaching import demonstrate_onions
+    >>> with tempfile.TemporaryDirectory() as folder:
+    ...     paths = write_onion_recordings(folder, demonstrate_onions(jax.random.key(0), 2))
+    >>> [path.name for path in paths]
+    ['states_1.csv', 'states_2.csv']
     """
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)

@@ -155,6 +155,21 @@ def onion_reaching(stride: float = STRIDE, horizon: int = 400) -> Environment:
     First states are drawn: five onions on the belt, each blemished with probability one half. The episode
     terminates when all are dealt with. The observation determines the onion in hand, so it is the state.
     Raises ``ValueError`` for a stride that is not positive.
+
+    See Also
+    --------
+    i2rl.domains.read_onion_recordings : recordings of the task
+    i2rl.inference.robust_airl : learn from noisy ones
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import onion_reaching
+    >>> task = onion_reaching()
+    >>> task.observation_size, task.actions.size, task.horizon
+    (29, 3, 400)
+    >>> task.observe(task.reset(jax.random.key(0))).shape
+    (29,)
     """
     if not stride > 0:
         raise ValueError(f"the stride is a length in metres, got {stride}")

@@ -240,6 +240,18 @@ def locomotion(name: str, *, terminate_when_unhealthy: bool = True, threads: int
 
     ``threads`` is by default the number of processor cores allowed to this process. Raises ``ValueError``
     for another name, and ``ModuleNotFoundError`` that says what to install where MuJoCo is missing.
+
+    See Also
+    --------
+    i2rl.domains.load_expert : an expert of each robot
+    i2rl.domains.mountain_car : a task without MuJoCo
+
+    Examples
+    --------
+    >>> from i2rl.domains import locomotion
+    >>> robot = locomotion("hopper")
+    >>> robot.observation_size, robot.actions.size, robot.horizon
+    (11, 3, 1000)
     """
     if name not in _TASKS:
         raise ValueError(f"the robot is one of {', '.join(ROBOTS)}; got {name!r}")

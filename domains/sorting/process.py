@@ -145,7 +145,22 @@ class MixedDemonstration(NamedTuple):
 
 @cache
 def sorting_with_claiming() -> Sorting:
-    """Build 26 states, 46 pairs, features of the actions: the default for two and three tasks."""
+    """Build 26 states, 46 pairs, features of the actions: the default for two and three tasks.
+
+    See Also
+    --------
+    i2rl.domains.demonstrate_sorting : simulate sorters
+    i2rl.domains.sorting_without_claiming : the released code's process
+
+    Examples
+    --------
+    >>> from i2rl.domains import sorting_with_claiming
+    >>> sorting = sorting_with_claiming()
+    >>> sorting.mdp.n_states, int(sorting.mdp.available.sum())
+    (26, 46)
+    >>> sorting.behaviours
+    ('pick-inspect-place', 'roll-pick-place', 'keep claiming')
+    """
     states = _parsed(_STATES_WITH_CLAIMING)
     return _sorting("sorting with claiming", states, _with_claiming, _deeds, BEHAVIOURS, _normalised())
 
@@ -156,6 +171,20 @@ def sorting_without_claiming() -> Sorting:
 
     Some of those features also fire by accident ("claims a new onion" when one is put back). Only 8 states
     have a real choice.
+
+    See Also
+    --------
+    i2rl.domains.sorting_with_claiming : the default
+    i2rl.domains.pick_inspect_place : the process without a list
+
+    Examples
+    --------
+    >>> from i2rl.domains import sorting_without_claiming
+    >>> sorting = sorting_without_claiming()
+    >>> sorting.mdp.n_states, int(sorting.mdp.available.sum())
+    (23, 31)
+    >>> int((sorting.mdp.available.sum(axis=1) > 1).sum())
+    8
     """
     states = _parsed(_STATES_WITHOUT_CLAIMING)
     return _sorting(
@@ -170,6 +199,20 @@ def pick_inspect_place() -> Sorting:
     One behaviour, with the weights the authors used for it, of L1 norm one (they divided by 14.3, which
     changes no policy). The features about the list are always zero. The first onion is an unknown one on
     the table, the hand anywhere.
+
+    See Also
+    --------
+    i2rl.domains.noisy_sorting : the same, seen through noise
+    i2rl.domains.sorting_with_claiming : the process of several behaviours
+
+    Examples
+    --------
+    >>> from i2rl.domains import pick_inspect_place
+    >>> sorting = pick_inspect_place()
+    >>> sorting.mdp.n_states, int(sorting.mdp.available.sum())
+    (22, 36)
+    >>> sorting.behaviours
+    ('pick-inspect-place',)
     """
     table = [State(TABLE, p, h, NO_LIST) for p, h in product(range(3), range(4))]
     held = [State(HELD, p, HOVERING, NO_LIST) for p in range(3)]
@@ -193,6 +236,19 @@ def demonstrate_sorting(
 
     Fewer counts than behaviours leave the last ones out. Raises ``ValueError`` for more counts than
     behaviours, a negative one, or no trajectory or step at all.
+
+    See Also
+    --------
+    i2rl.domains.sorting_with_claiming : a process to sort in
+    i2rl.inference.mme_mtirl : tell the behaviours apart
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import demonstrate_sorting, sorting_with_claiming
+    >>> mixed = demonstrate_sorting(jax.random.key(0), sorting_with_claiming(), [2, 1], steps=10)
+    >>> mixed.demonstration.lengths.tolist(), mixed.labels.tolist()
+    ([10, 10, 10], [0, 0, 1])
     """
     if len(counts) > len(sorting.behaviours) or min(counts, default=0) < 0 or not sum(counts):
         raise ValueError(
