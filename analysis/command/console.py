@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import os
 import sys
-from collections.abc import Iterator, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import click
 import typer
 
 if TYPE_CHECKING:
@@ -17,6 +19,8 @@ if TYPE_CHECKING:
     from rich.console import Console
 
 LONGEST_MESSAGE = 1000
+_FIRST_STEP = "starting: the first step is compiled, unless the cache has its program"
+_SECONDS_A_LINE = 2.0
 
 
 def print_results(teller: Any, study: Any, folder: Path, as_json: bool) -> None:
@@ -55,11 +59,22 @@ def reported_errors() -> Iterator[None]:
         raise typer.Exit(1) from None
 
 
+def _is_quiet() -> bool:
+    context = click.get_current_context(silent=True)
+    return context is not None and bool(context.find_root().params.get("quiet"))
+
+
 @contextmanager
 def progress(quiet: bool) -> Iterator[Any]:
-    """Show progress on a terminal; yield ``advance(description, fraction)``, silent elsewhere."""
-    if quiet or not sys.stderr.isatty():
+    """Show progress on standard error; yield ``advance(description, fraction)``.
+
+    A terminal shows a bar. A file or a pipe gets a line a step, at most one every two seconds.
+    """
+    if quiet or _is_quiet():
         yield lambda description, fraction: None
+        return
+    if not sys.stderr.isatty():
+        yield _lines()
         return
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeElapsedColumn
@@ -69,13 +84,28 @@ def progress(quiet: bool) -> Iterator[Any]:
     description = TextColumn("{task.description}", markup=False)
     columns = (SpinnerColumn(), description, BarColumn(), TimeElapsedColumn())
     with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
-        task = bar.add_task("starting", total=None)
+        task = bar.add_task(_FIRST_STEP, total=None)
 
         def advance(description: str, fraction: float | None) -> None:
             total = None if fraction is None else 1.0
             bar.update(task, description=printable(description), total=total, completed=fraction or 0.0)
 
         yield advance
+
+
+def _lines() -> Callable[[str, float | None], None]:
+    """Return ``advance(description, fraction)`` that prints lines, the first one now."""
+    print_message(_FIRST_STEP)
+    before = time.monotonic()
+
+    def advance(description: str, fraction: float | None) -> None:
+        nonlocal before
+        if time.monotonic() - before >= _SECONDS_A_LINE:
+            before = time.monotonic()
+            share = "" if fraction is None else f" ({fraction:.0%})"
+            print_message(f"{description}{share}")
+
+    return advance
 
 
 def output_console() -> Console:

@@ -92,14 +92,14 @@ def options(folder, **changes) -> list[str]:
 
 def call(*arguments: object, given: str | None = None):
     """Run a command that is expected to succeed."""
-    result = CliRunner().invoke(app, [str(a) for a in arguments], input=given)
+    result = CliRunner().invoke(app, ["--quiet", *map(str, arguments)], input=given)
     assert result.exit_code == 0, (result.stderr, result.exception)
     return result
 
 
 def refused(*arguments: object) -> str:
     """Run a command that is expected to fail with one line, and return it."""
-    result = CliRunner().invoke(app, [str(a) for a in arguments])
+    result = CliRunner().invoke(app, ["--quiet", *map(str, arguments)])
     assert result.exit_code == 1, (result.stdout, result.exception)
     assert isinstance(result.exception, SystemExit)
     assert re.fullmatch(r"Error: .*\n", result.stderr), result.stderr
@@ -457,7 +457,7 @@ def test_mistakes_in_the_options_are_told_in_one_line(house, monkeypatch, change
 
 def test_a_broken_line_is_told_and_the_sessions_before_it_are_kept(house):
     (house / "demos.jsonl").write_text("".join([*LINES[:2], '{"steps": [{"s": "west"}, {"s": "attic"}]}\n']))
-    result = CliRunner().invoke(app, options(house))
+    result = CliRunner().invoke(app, ["--quiet", *options(house)])
     assert result.exit_code == 1
     assert result.stderr == (
         "Error: demos.jsonl, line 3, step 1: unknown state 'attic'; "
@@ -500,6 +500,14 @@ def test_an_unknown_option_is_a_mistake_of_usage(house):
     result = CliRunner().invoke(app, [*options(house), "--sesion-size", "2"])
     assert result.exit_code == 2
     assert "No such option" in result.stderr
+
+
+def test_commands_say_what_they_do_from_the_start_unless_they_are_quiet(house):
+    (house / "demos.jsonl").write_text(LINES[0])
+    result = CliRunner().invoke(app, options(house))
+    assert result.exit_code == 0
+    assert result.stderr.startswith("starting: the first step is compiled")
+    assert call(*options(house, journal=house / "other.db")).stderr == ""
 
 
 # -- as a process -----------------------------------------------------------------------------------------
