@@ -296,7 +296,23 @@ def adversarial(
 
 
 def airl(generator: Any, *, training: AdversarialTraining | None = None, **networks: Any) -> Learner:
-    """Build AIRL that takes observations for the truth; ``networks`` goes to :func:`airl_discriminator`."""
+    """Build AIRL that takes observations for the truth; ``networks`` goes to :func:`airl_discriminator`.
+
+    See Also
+    --------
+    i2rl.inference.gail : a classifier in place of a reward
+    i2rl.inference.robust_airl : samples the truth behind the observations
+    i2rl.inference.airl_tabular : the learner of tabular tasks
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import cart_pole
+    >>> from i2rl.inference import airl, ppo
+    >>> learner = airl(ppo(cart_pole(), n_envs=2, n_steps=8, minibatch=8))
+    >>> learner.name, learner.init(jax.random.key(0)).weights.shape  # parameters of its networks
+    ('AIRL', (1507,))
+    """
     task = generator.environment
     networks.setdefault("discount", generator.settings.gamma)
     discriminator = airl_discriminator(task.observation_size, task.actions, **networks)
@@ -304,7 +320,21 @@ def airl(generator: Any, *, training: AdversarialTraining | None = None, **netwo
 
 
 def gail(generator: Any, *, training: AdversarialTraining | None = None, **networks: Any) -> Learner:
-    """Build GAIL that takes observations for the truth; ``networks`` goes to :func:`gail_discriminator`."""
+    """Build GAIL that takes observations for the truth; ``networks`` goes to :func:`gail_discriminator`.
+
+    See Also
+    --------
+    i2rl.inference.airl : learns a reward
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import cart_pole
+    >>> from i2rl.inference import gail, ppo
+    >>> learner = gail(ppo(cart_pole(), n_envs=2, n_steps=8, minibatch=8), hidden=(16, 16))
+    >>> learner.name, learner.init(jax.random.key(0)).weights.shape  # parameters of its networks
+    ('GAIL', (409,))
+    """
     task = generator.environment
     networks.setdefault("discount", generator.settings.gamma)
     discriminator = gail_discriminator(task.observation_size, task.actions, **networks)

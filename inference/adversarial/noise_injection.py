@@ -268,6 +268,22 @@ def noisy_airl(
     ``state_only=True`` for the published method (whose discount is 1; here it must be below 1, so that the
     value after termination is finite). ``agent`` has as many environments as there are noise levels, or a
     multiple. ``configuration`` adds to the configuration that identifies the learner to a journal.
+
+    See Also
+    --------
+    i2rl.inference.ssrr : regresses a reward on ranked trajectories
+    i2rl.inference.airl : the learner without injected noise
+
+    Examples
+    --------
+    >>> from i2rl.domains import cart_pole
+    >>> from i2rl.inference import noisy_airl, ppo
+    >>> from i2rl.inference.adversarial.discriminator import airl_discriminator
+    >>> agent = ppo(cart_pole(), n_envs=10, n_steps=8, minibatch=8)
+    >>> discriminator = airl_discriminator(4, agent.environment.actions, state_only=True)
+    >>> learner = noisy_airl(agent, discriminator)
+    >>> learner.name, learner.configuration["levels"]
+    ('noisy-AIRL', (0.0, 0.0, 0.0, 0.0, 0.0, 0.05, 0.1, 0.15, 0.2, 0.25))
     """
     environment, settings = agent.environment, agent.settings
     n, size = settings.n_envs, settings.steps

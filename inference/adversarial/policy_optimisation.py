@@ -168,6 +168,21 @@ def ppo(environment: Task, **settings: Any) -> PPO:
     Scaled observations help if their coordinates differ in size, as a robot's do. They hinder the cart-pole,
     which is learned in 25,000 steps with ``learning_rate=1e-3``, ``scale_observations=False`` and
     ``scale_rewards=True``. Raises ``ValueError`` for a setting out of its range.
+
+    See Also
+    --------
+    i2rl.inference.airl : learns a reward with this agent
+    i2rl.domains.cart_pole : the task
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import cart_pole
+    >>> from i2rl.inference import ppo
+    >>> agent = ppo(cart_pole(), n_envs=2, n_steps=8, minibatch=8)
+    >>> state, rollout = agent.collect(agent.init(jax.random.key(0)))
+    >>> rollout.observations.shape, agent.settings.steps
+    ((8, 2, 4), 16)
     """
     chosen = _checked(Settings(**settings))
 

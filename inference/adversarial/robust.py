@@ -191,6 +191,24 @@ def robust_airl(
     ValueError
         For an invalid sensor: a covariance of another size or not positive definite, a probability outside
         [0, 1].
+
+    See Also
+    --------
+    i2rl.inference.gaussian_truth : the truth of Gaussian sensors
+    i2rl.inference.airl : takes observations for the truth
+    i2rl.inference.robust_airl_tabular : the learner of tabular tasks
+
+    Examples
+    --------
+    >>> from i2rl.domains import onion_reaching
+    >>> from i2rl.inference import gaussian_truth, ppo, robust_airl
+    >>> from i2rl.models import GaussianSensor
+    >>> robot = onion_reaching()
+    >>> agent = ppo(robot, n_envs=2, n_steps=8, minibatch=8)
+    >>> truth = gaussian_truth(robot, robot.observation_size)
+    >>> learner = robust_airl(agent, truth, GaussianSensor(0.01, 0.01))  # variances
+    >>> learner.name, learner.mdp.observation_size, learner.mdp.n_actions
+    ('robust-AIRL', 29, 3)
     """
     return _learner("robust-AIRL", generator, Smoothed(truth, sensor), discriminator, training)
 

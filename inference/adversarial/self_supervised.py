@@ -310,6 +310,21 @@ def ssrr(
     regressed reward. Both policies, both rewards and their optimisers continue from the session before; the
     demonstrations and the ranked trajectories are discarded. The published method uses SAC and episodes that
     do not end early; here ``agent`` improves both policies.
+
+    See Also
+    --------
+    i2rl.inference.noisy_airl : the first part of each session
+
+    Examples
+    --------
+    >>> from i2rl.domains import cart_pole
+    >>> from i2rl.inference import ppo, ssrr
+    >>> from i2rl.inference.adversarial.discriminator import airl_discriminator
+    >>> agent = ppo(cart_pole(), n_envs=10, n_steps=8, minibatch=8)
+    >>> discriminator = airl_discriminator(4, agent.environment.actions, state_only=True)
+    >>> learner = ssrr(agent, discriminator)
+    >>> learner.name, learner.mdp.name
+    ('SSRR', 'cart-pole')
     """
     environment, settings = agent.environment, agent.settings
     how = (training or SSRRTraining()).checked()

@@ -415,6 +415,23 @@ def gibbs_mixture_posterior(
     ------
     DemonstrationError, ValueError
         As :func:`sample_mixture_posterior`; also for ``auxiliary``, ``moves`` or ``thin`` below one.
+
+    See Also
+    --------
+    i2rl.inference.sample_mixture_posterior : the truncated model by NUTS
+    i2rl.models.mixture_model : the truncated model
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import gibbs_mixture_posterior
+    >>> mdp, _, sensor, demonstration = five_cells()
+    >>> data = gibbs_mixture_posterior(
+    ...     jax.random.key(0), mdp, sensor, demonstration, draws=20, warmup=20, chains=1
+    ... )
+    >>> data.assignments["assignment"].shape, data.assignments["co_clustering"].shape
+    ((1, 20, 8), (8, 8))
     """
     draws, warmup, chains, auxiliary, moves, thin = GibbsSampling(**sampling)
     key = as_key(key)

@@ -171,6 +171,24 @@ def sample_mixture_posterior(
     ValueError
         For an empty demonstration, a prior of another shape, a concentration that is not positive, numbers of
         components, draws or chains below one, or an undiscounted MDP.
+
+    See Also
+    --------
+    i2rl.models.mixture_model : the model
+    i2rl.inference.gibbs_mixture_posterior : moves trajectories one at a time
+    i2rl.inference.mme_mtirl : learns in sessions
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_mixture_posterior
+    >>> mdp, _, sensor, demonstration = five_cells()
+    >>> data = sample_mixture_posterior(
+    ...     jax.random.key(0), mdp, sensor, demonstration, components=2, draws=20, warmup=20, chains=1
+    ... )
+    >>> dict(data.posterior["weights"].sizes), data.assignments["assignment"].shape
+    ({'chain': 1, 'draw': 20, 'component': 2, 'feature': 2}, (1, 20, 8))
     """
     draws, warmup, chains, target_accept, max_tree_depth = _SAMPLING.but(sampling)
     key = as_key(key)

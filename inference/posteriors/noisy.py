@@ -281,6 +281,25 @@ def sample_noisy_posterior(
     ValueError
         For an empty demonstration, predicates, priors or names that do not fit, numbers of draws or chains
         below one, or an undiscounted MDP.
+
+    See Also
+    --------
+    i2rl.models.noisy_behaviour_model : the model
+    i2rl.inference.rimeo : learns in sessions
+
+    Examples
+    --------
+    >>> import jax
+    >>> import numpy as np
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_noisy_posterior
+    >>> mdp, _, view, demonstration = five_cells()
+    >>> predicates = np.indices((5, 3))  # the cell and the action of each pair
+    >>> data = sample_noisy_posterior(
+    ...     jax.random.key(0), mdp, predicates, demonstration, view=view, draws=20, warmup=20, chains=1
+    ... )
+    >>> dict(data.posterior["reliabilities"].sizes)
+    {'chain': 1, 'draw': 20, 'predicate': 2}
     """
     names = sampling.pop("names", None)
     draws, warmup, chains, target_accept, max_tree_depth = Sampling().but(sampling).checked()

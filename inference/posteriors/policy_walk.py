@@ -195,6 +195,22 @@ def birl(
     ValueError
         For numbers that are not positive, a prior of another shape or that excludes the whole box, or an
         undiscounted MDP.
+
+    See Also
+    --------
+    i2rl.inference.sample_posterior : the posterior with hidden steps
+    i2rl.inference.mlirl : the likeliest weights
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import birl
+    >>> from i2rl.models import Demonstration
+    >>> walk = Demonstration.from_pairs([[0, 1, 2, 3, 4, 4]], [[1, 1, 1, 1, 2, 2]])
+    >>> data = birl(jax.random.key(0), five_cells().mdp, walk, draws=20, warmup=20, chains=1)
+    >>> dict(data.posterior["weights"].sizes)
+    {'chain': 1, 'draw': 20, 'feature': 2}
     """
     draws, warmup, chains, step = Walking(**sampling)
     require_discounted(mdp)

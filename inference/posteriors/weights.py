@@ -315,6 +315,21 @@ def sample_posterior(
     ValueError
         For an empty demonstration, a prior of another shape, numbers of draws or chains below one, or an
         undiscounted MDP.
+
+    See Also
+    --------
+    i2rl.models.occlusion_model : the model
+    i2rl.inference.batch_lme : the likeliest weights
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_posterior
+    >>> mdp, _, sensor, demonstration = five_cells()
+    >>> data = sample_posterior(jax.random.key(0), mdp, sensor, demonstration, draws=20, warmup=20, chains=1)
+    >>> dict(data.posterior["weights"].sizes), data.completions["state"].shape
+    ({'chain': 1, 'draw': 20, 'feature': 2}, (1, 20, 8, 6))
     """
     settings = Sampling(**sampling).checked()
     key, demonstration = as_key(key), checked_demonstration(mdp, demonstration)

@@ -81,6 +81,22 @@ def airl_tabular(mdp: TabularMDP, **options: Any) -> Learner:
     """Build online AIRL that takes observations for the truth and leaves out hidden steps.
 
     A session of hidden steps alone changes nothing. Options as for :func:`robust_airl_tabular`.
+
+    See Also
+    --------
+    i2rl.inference.robust_airl_tabular : infers the truth behind the observations
+    i2rl.inference.airl : the learner of continuous tasks
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import airl_tabular
+    >>> corridor = five_cells()
+    >>> learner = airl_tabular(corridor.mdp, iterations=2, horizon=8)
+    >>> state, info = learner.update(learner.init(jax.random.key(0)), corridor.demonstration)
+    >>> learner.name, info.session
+    ('AIRL', 1)
     """
     return _at_face_value("AIRL", mdp, tabular_airl, _AIRL, options)
 
@@ -109,6 +125,22 @@ def robust_airl_tabular(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> L
     ------
     ValueError
         For discount 1, a sensor for another task, features of another shape, or an invalid option.
+
+    See Also
+    --------
+    i2rl.inference.airl_tabular : takes observations for the truth
+    i2rl.inference.robust_airl : the learner of continuous tasks
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import robust_airl_tabular
+    >>> corridor = five_cells()
+    >>> learner = robust_airl_tabular(corridor.mdp, corridor.sensor, iterations=2, horizon=8)
+    >>> state, info = learner.update(learner.init(jax.random.key(0)), corridor.demonstration)
+    >>> learner.name, info.session
+    ('robust-AIRL', 1)
     """
     return _in_expectation("robust-AIRL", mdp, sensor, tabular_airl, _AIRL, options)
 
