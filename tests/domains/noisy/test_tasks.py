@@ -418,7 +418,7 @@ def test_noise_outside_zero_and_one_is_refused(level: float) -> None:
     ("swaps", "message"),
     [
         (np.array([[[1, 2, 0]]]), "takes pair 0 for 1"),
-        (np.array([[[1, 0, 2]], [[0, 2, 1]]]), "different order"),
+        (np.array([[[1, 0, 2]], [[0, 2, 1]]]), "do not commute"),
         (np.array([[[1, 0, 2]], [[1, 0, 2]]]), "same other pair"),
         (np.array([[[0, 1, 3]]]), "0 to 2"),
         (np.array([0, 1, 2]), r"\[M, S, A\]"),
@@ -445,7 +445,7 @@ def test_as_many_noises_as_swaps() -> None:
         ({"reliabilities": np.full(3, 0.5), "scores": "product"}, "8 probabilities"),
         ({"reliabilities": np.full(8, 1.5), "scores": "product"}, "8 probabilities"),
         ({"noise": Visibility(np.ones(22))}, "no observation model"),
-        ({"view": Visibility(np.ones(5))}, "22 states"),
+        ({"visibility": Visibility(np.ones(5))}, "22 states"),
     ],
 )
 def test_demonstrations_of_nothing_are_refused(options: dict, message: str) -> None:
