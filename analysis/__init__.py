@@ -3,7 +3,6 @@
 Names are loaded when they are first used.
 """
 
-from .. import precision  # noqa: F401  (before anything computes)
 from ..lazy import attached
 
 __getattr__, __dir__, __all__ = attached(__name__, __file__)
