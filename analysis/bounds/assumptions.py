@@ -184,6 +184,21 @@ def check(
     ValueError
         For weights or a policy of another shape than the MDP's, a state without its learner, or a learner
         of another MDP.
+
+    See Also
+    --------
+    i2rl.analysis.lme_i2rl_confidence : a bound to check
+    i2rl.analysis.observed_bound : another
+
+    Examples
+    --------
+    >>> from i2rl.analysis import check, me_i2rl_confidence
+    >>> from i2rl.domains import five_cells
+    >>> corridor = five_cells()
+    >>> bound = me_i2rl_confidence(400, 0.1, corridor.mdp.n_features, 0.9)
+    >>> checked = check(bound, mdp=corridor.mdp, weights=corridor.weights, length=50)
+    >>> [(a.name, a.reason) for a in checked.violated]
+    [('weights', 'they range from -0.2 to 2')]
     """
     if learner is None and state is not None:
         raise ValueError("a state is checked against its learner: give both")

@@ -180,6 +180,20 @@ def rimeo_confidence(
     program's slack has to be ``epsilon_r / (1 - gamma)``; the proof starts with ``epsilon / (1 - gamma)``,
     for which the cited step fails. It also takes ``|theta|_1 = 1``, which gives ``2 epsilon_r / (1 -
     gamma)``: the factor ``K`` belongs to weights in [0, 1]^K (:func:`noisy_confidence` has it as ``norm``).
+
+    See Also
+    --------
+    i2rl.analysis.lme_i2rl_confidence : the same without noise
+    i2rl.analysis.perception_needed : ask for the sizes
+
+    Examples
+    --------
+    >>> from i2rl.analysis import rimeo_confidence
+    >>> from i2rl.analysis.bounds.distance import Perception
+    >>> perception = Perception(observations=100_000, epsilon_o=0.01, predicates=3, longest=4)
+    >>> bound = rimeo_confidence(400, 1000, 0.1, 0.05, perception, n_features=2, discount=0.9)
+    >>> round(bound.error, 1), round(bound.confidence, 2)
+    (10.8, 0.97)
     """
     lemma = rimeo_constraint_bound(size, draws, epsilon, epsilon_s, perception, n_features)
     return Bound(
@@ -220,6 +234,18 @@ def perception_needed(
     and ``corrected`` and columns ``trajectories``, ``draws`` (of completions), ``observations`` (``n_o``) and
     ``epsilon_o``. Raises ``ValueError`` for an error outside (0, 1], a confidence outside (0, 1), or counts
     below 1.
+
+    See Also
+    --------
+    i2rl.analysis.rimeo_confidence : the theorem's own direction
+    i2rl.analysis.demonstrations_needed : the same without noise
+
+    Examples
+    --------
+    >>> from i2rl.analysis import perception_needed
+    >>> table = perception_needed(n_features=2, predicates=3, longest=4, error=0.3, confidence=0.9)
+    >>> table[["trajectories", "reports"]].to_dict("index")
+    {'printed': {'trajectories': 240, 'reports': 42380}, 'corrected': {'trajectories': 98, 'reports': 13229}}
     """
     counted("predicates", predicates), counted("longest", longest)
     if not 0 < error <= 1:

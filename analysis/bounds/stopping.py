@@ -130,6 +130,19 @@ def judge_stops(
     """Judge each stream's stop (a session from 1, or 0 for never) by the definition of a false stop.
 
     Raises ``ValueError`` for stops that do not fit the streams, a negative margin or a tail of no session.
+
+    See Also
+    --------
+    i2rl.inference.LikelihoodChange : a rule to stop by
+    i2rl.inference.MovingWindow : another
+
+    Examples
+    --------
+    >>> from i2rl.analysis import judge_stops
+    >>> accuracy = [[0.5, 0.9, 0.9, 0.9], [0.4, 0.5, 0.6, 0.9]]
+    >>> verdict = judge_stops([2, 2], accuracy, margin=0.05, tail=1)
+    >>> verdict.false_rate, verdict.saved
+    (0.5, 0.5)
     """
     stops, accuracy = np.asarray(stops), np.asarray(accuracy, float)
     replications, sessions = accuracy.shape

@@ -103,6 +103,21 @@ def me_i2rl_confidence(size: float, epsilon: float, n_features: int, discount: f
     ``LL(theta_E) - LL(theta^i) <= 2 K epsilon / (1 - gamma)`` with probability at least ``max(0, 1 -
     delta)``, ``delta = 2 K exp(-2 n epsilon^2)``. Inverses: :func:`size_for` and :func:`error_for` with ``K``
     events. Raises ``ValueError`` for sizes or errors that are not positive, or a discount outside [0, 1).
+
+    See Also
+    --------
+    i2rl.analysis.lme_i2rl_confidence : the same with hidden steps
+    i2rl.analysis.check : decide its assumptions
+    i2rl.analysis.demonstrations_needed : ask for the number of trajectories
+
+    Examples
+    --------
+    >>> from i2rl.analysis import me_i2rl_confidence
+    >>> bound = me_i2rl_confidence(size=400, epsilon=0.1, n_features=2, discount=0.9)
+    >>> round(bound.error, 2), round(bound.confidence, 3)
+    (4.0, 0.999)
+    >>> bound.assuming(full_view=True).undecided[0].statement
+    'features lie in [0, 1]'
     """
     discounted(discount)
     delta = failure_probability(size, epsilon, n_features)
@@ -158,6 +173,19 @@ def lme_i2rl_confidence(
 
     ``LL(theta_E) - LL(theta^i) <= 4 K epsilon_l / (1 - gamma)``, ``epsilon_l = (epsilon + epsilon_s) / 2``,
     with probability at least ``max(0, 1 - delta - delta_s)``. The program's slack is ``2 epsilon_l``.
+
+    See Also
+    --------
+    i2rl.analysis.me_i2rl_confidence : the same in full view
+    i2rl.analysis.rimeo_confidence : the same with noise
+    i2rl.analysis.check : decide its assumptions
+
+    Examples
+    --------
+    >>> from i2rl.analysis import lme_i2rl_confidence
+    >>> bound = lme_i2rl_confidence(400, 1000, 0.1, 0.05, n_features=2, discount=0.9)
+    >>> round(bound.error, 2), round(bound.confidence, 2)
+    (6.0, 0.97)
     """
     lemma = lme_constraint_bound(size, draws, epsilon, epsilon_s, n_features)
     return Bound(
@@ -199,6 +227,21 @@ def no_regret(
     surely.
 
     ``session_sizes [T]`` are the trajectories of each session.
+
+    See Also
+    --------
+    i2rl.analysis.me_i2rl_confidence : the bound of one session
+    i2rl.inference.average_regret : the regret of a run
+    i2rl.inference.Harmonic : the slack it asks for
+
+    Examples
+    --------
+    >>> from i2rl.analysis import no_regret
+    >>> regret = no_regret(2.0, [100, 100, 100], n_features=2, discount=0.9)
+    >>> regret.average.round(2).tolist()
+    [8.0, 6.0, 4.89]
+    >>> regret.confidence.round(2).tolist()
+    [1.0, 0.93, 0.67]
     """
     positive("c", c), counted("n_features", n_features), discounted(discount)
     sizes = np.cumsum(counted_sessions(session_sizes))
@@ -319,6 +362,20 @@ def observed_bound(
     ------
     ValueError
         For a confidence outside (0, 1), features out of range, or fewer than two trajectories.
+
+    See Also
+    --------
+    i2rl.analysis.me_i2rl_confidence : the bound from sizes alone
+    i2rl.analysis.demonstrations_needed : plan for it
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.analysis import observed_bound
+    >>> features = np.tile([[4.0, 1.0], [4.5, 1.5]], (200, 1))
+    >>> found = observed_bound(features, 0.95, 0.9)
+    >>> found.target.round(1).tolist(), found.slack.round(1).tolist()
+    ([4.3, 1.3], [0.2, 0.2])
     """
     x = np.asarray(features, float) * (1 - discounted(discount))
     if x.ndim != 2:
@@ -379,6 +436,18 @@ def demonstrations_needed(
     Returns a table with columns ``trajectories``, ``draws`` (of the hidden steps, in all) and
     ``error_nats``. Raises ``ValueError`` for a confidence outside (0, 1), errors that are not positive, or
     deviations that are not ``[K]``.
+
+    See Also
+    --------
+    i2rl.analysis.lme_i2rl_confidence : the theorem's own direction
+    i2rl.analysis.perception_needed : the same with noise
+
+    Examples
+    --------
+    >>> from i2rl.analysis import demonstrations_needed
+    >>> table = demonstrations_needed(2, 0.05, 0.9, 0.9)
+    >>> table.loc[["theorem", "exact completion"], "trajectories"].tolist()
+    [877, 185]
     """
     counted("n_features", n_features), positive("epsilon_s", epsilon_s), positive("epsilon", epsilon)
     delta = (1 - probability("confidence", confidence)) / 2

@@ -49,6 +49,21 @@ def learning_curves(
 
     ``expert_log_likelihood`` (nats per trajectory) draws the level of the true weights. ``x_scale`` is
     ``linear`` or ``log``. Raises ``ValueError`` for arrays that do not fit.
+
+    See Also
+    --------
+    i2rl.analysis.weights_plot : draw what was learned
+    i2rl.analysis.quantile_band : compute the bands
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.analysis import learning_curves
+    >>> from i2rl.analysis.drawing.charts import LearningCurve
+    >>> accuracy = np.array([[0.4, 0.7, 0.9], [0.5, 0.8, 0.9]])
+    >>> figure = learning_curves([LearningCurve("LME-I2RL", np.arange(1, 4), accuracy, 10 * accuracy - 12)])
+    >>> [(axes.get_xlabel(), axes.get_ylabel()) for axes in figure.axes]
+    [('session', 'share of states'), ('session', 'nats per trajectory')]
     """
     figure = new_figure(theme, 9.2, 4.1)
     figure.get_layout_engine().set(wspace=0.05)  # type: ignore[union-attr, call-arg]
@@ -198,6 +213,22 @@ def weights_plot(
     Points are medians, bars hold ``coverage`` of the draws. Different directions may prescribe one
     behaviour: a reward is identified no further than that. Raises ``ValueError`` if shapes do not fit or
     if weights are all zero.
+
+    See Also
+    --------
+    i2rl.analysis.learning_curves : draw how it was learned
+    i2rl.analysis.forest_plot : draw a posterior, chain by chain
+
+    Examples
+    --------
+    >>> from i2rl.analysis import weights_plot
+    >>> from i2rl.domains import five_cells
+    >>> corridor = five_cells()
+    >>> figure = weights_plot(corridor.mdp.feature_names, corridor.weights, [[1.8, -0.3], [2.2, -0.1]])
+    >>> figure.axes[0].get_xlabel()
+    'weight (share of the L1 norm)'
+    >>> [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    ['at the end', 'moves']
     """
     truth, draws = _direction(np.asarray(true_weights)[None])[0], _direction(np.atleast_2d(learned))
     if draws.shape[1] != len(truth) or len(feature_names) != len(truth):

@@ -75,6 +75,21 @@ def policy_accuracy(mdp: TabularMDP, optimal: Bool[Array, "S A"], policy: Float[
 
     For a deterministic policy this is LBA; pass a policy here to break its ties differently. Every optimal
     action counts as a match.
+
+    See Also
+    --------
+    i2rl.analysis.learned_behavior_accuracy : the same of learned weights
+    i2rl.analysis.evaluate : every measure at once
+
+    Examples
+    --------
+    >>> import jax.numpy as jnp
+    >>> from i2rl.analysis import policy_accuracy
+    >>> from i2rl.domains import five_cells
+    >>> mdp = five_cells().mdp
+    >>> right, uniform = jnp.eye(3)[jnp.ones(5, int)], jnp.full((5, 3), 1 / 3)
+    >>> [round(float(policy_accuracy(mdp, right > 0, policy).overall), 2) for policy in (right, uniform)]
+    [1.0, 0.33]
     """
     hit = jnp.sum(jnp.where(optimal, policy, 0.0), axis=1)
     choice = jnp.sum(mdp.available, axis=1) > 1
@@ -98,6 +113,21 @@ def learned_behavior_accuracy(
 
     The learner commits to one action per state, as in :func:`greedy_policy` (so a constant reward is not
     credited with every action); the expert's ties all count. Source: section 7.2. Errors as there.
+
+    See Also
+    --------
+    i2rl.analysis.inverse_learning_error : what the errors cost
+    i2rl.analysis.evaluate : both at once
+
+    Examples
+    --------
+    >>> from i2rl.analysis import learned_behavior_accuracy
+    >>> from i2rl.domains import five_cells
+    >>> corridor = five_cells()
+    >>> float(learned_behavior_accuracy(corridor.mdp, corridor.weights, corridor.weights / 2).overall)
+    1.0
+    >>> float(learned_behavior_accuracy(corridor.mdp, corridor.weights, [0.0, -1.0]).overall)
+    0.2
     """
     return evaluate(mdp, true_weights, learned_weights).accuracy
 
@@ -136,6 +166,21 @@ def inverse_learning_error(
 
     ``||V^{pi*} - V^{pi}||_1`` sums over states; both values are exact and under the true reward (chapter 3,
     section 7.2). Errors as for :func:`greedy_policy`.
+
+    See Also
+    --------
+    i2rl.analysis.learned_behavior_accuracy : how often the behaviours agree
+    i2rl.analysis.evaluate : both at once
+
+    Examples
+    --------
+    >>> from i2rl.analysis import inverse_learning_error
+    >>> from i2rl.domains import five_cells
+    >>> corridor = five_cells()
+    >>> round(float(inverse_learning_error(corridor.mdp, corridor.weights, corridor.weights / 2).relative), 2)
+    0.0
+    >>> round(float(inverse_learning_error(corridor.mdp, corridor.weights, [0.0, -1.0]).relative), 2)
+    0.74
     """
     return evaluate(mdp, true_weights, learned_weights).error
 
@@ -154,6 +199,23 @@ def evaluate(
 
     Maps over learned weights ``[N, K]`` with ``jax.vmap(partial(evaluate, mdp, true_weights))``. Raises
     ``ValueError`` as :func:`greedy_policy` does.
+
+    See Also
+    --------
+    i2rl.analysis.learned_behavior_accuracy : the accuracy alone
+    i2rl.analysis.inverse_learning_error : the error alone
+    i2rl.analysis.demonstration_log_likelihoods : judge without an expert
+
+    Examples
+    --------
+    >>> from i2rl.analysis import evaluate
+    >>> from i2rl.domains import five_cells
+    >>> corridor = five_cells()
+    >>> judged = evaluate(corridor.mdp, corridor.weights, [0.0, -1.0])
+    >>> round(float(judged.accuracy.overall), 1), round(float(judged.error.relative), 2)
+    (0.2, 0.74)
+    >>> round(float(judged.value), 1), round(float(judged.best_value), 1)
+    (0.0, 11.8)
     """
     return _evaluate(mdp, _checked(mdp, true_weights), _checked(mdp, learned_weights))
 
@@ -165,6 +227,21 @@ def demonstration_log_likelihoods(
 
     Hidden steps are summed out (section 1 of the methods); ``-inf`` for a trajectory the model rules out.
     Errors as for :func:`greedy_policy`, and ``ValueError`` for a sensor made for another MDP.
+
+    See Also
+    --------
+    i2rl.analysis.evaluate : judge by the expert's weights
+    i2rl.inference.log_likelihoods : the same under any policy
+
+    Examples
+    --------
+    >>> from i2rl.analysis import demonstration_log_likelihoods
+    >>> from i2rl.domains import five_cells
+    >>> mdp, weights, sensor, demonstration = five_cells()
+    >>> expert = demonstration_log_likelihoods(mdp, sensor, weights, demonstration)
+    >>> uniform = demonstration_log_likelihoods(mdp, sensor, 0 * weights, demonstration)
+    >>> expert.shape, bool(expert.sum() > uniform.sum())
+    ((8,), True)
     """
     # Padded to a power of two, so that demonstrations of many sizes share a compiled program.
     sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
@@ -250,6 +327,20 @@ def quantile_band(replications: Float[np.ndarray, "replications ..."], coverage:
     The band says where the middle ``coverage`` of the replications lie; it is not a confidence interval of
     the median. A NaN among the replications makes its column NaN rather than vanish. Raises ``ValueError``
     without replications or for a coverage outside (0, 1).
+
+    See Also
+    --------
+    i2rl.analysis.learning_curves : draw such bands
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.analysis import quantile_band
+    >>> band = quantile_band(np.array([[0.2, 0.6], [0.4, 0.8], [0.6, 1.0]]))
+    >>> band.median.tolist()
+    [0.4, 0.8]
+    >>> band.low.round(2).tolist(), band.high.round(2).tolist()
+    ([0.3, 0.7], [0.5, 0.9])
     """
     replications = np.asarray(replications, float)
     if replications.ndim < 1 or replications.shape[0] == 0:

@@ -61,6 +61,23 @@ def expected_value_difference(
     ValueError
         For shapes or numbers that do not fit, weights that are not numbers, an unknown state, no trajectory
         at all, or discount 1.
+
+    See Also
+    --------
+    i2rl.analysis.assignment_accuracy : how well trajectories were told apart
+    i2rl.analysis.inverse_learning_error : the loss of a single reward
+
+    Examples
+    --------
+    >>> from i2rl.analysis import expected_value_difference
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import Demonstration
+    >>> mdp, weights = five_cells()[:2]
+    >>> walks = Demonstration.from_pairs([[0, 1, 2], [0, 1, 2]], [[1, 1, 1], [1, 1, 1]])
+    >>> expected_value_difference(mdp, weights[None], [0, 0], 3 * weights[None], [0, 0], walks)
+    0.0
+    >>> expected_value_difference(mdp, weights[None], [0, 0], [weights, -weights], [0, 1], walks) > 10
+    True
     """
     require_discounted(mdp)
     truth, found = (_weights(mdp, name, w) for name, w in (("true", true_weights), ("learned", learned)))
@@ -102,6 +119,19 @@ def assignment_accuracy(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarr
     """Compute the share of trajectories in their behaviour's component, under the best one-to-one matching.
 
     Raises ``ValueError`` for no trajectory or another number of labels than of assignments.
+
+    See Also
+    --------
+    i2rl.analysis.match_components : the matching itself
+    i2rl.analysis.expected_value_difference : what wrong assignments cost
+
+    Examples
+    --------
+    >>> from i2rl.analysis import assignment_accuracy
+    >>> assignment_accuracy([0, 0, 1, 1], [5, 5, 3, 3])
+    1.0
+    >>> assignment_accuracy([0, 0, 1, 1], [5, 5, 3, 5])
+    0.75
     """
     table, _, _ = _contingency(labels, assignments)
     return float(table[linear_sum_assignment(table, maximize=True)].sum() / table.sum())
@@ -112,6 +142,19 @@ def match_components(labels: Int[np.ndarray, " n"], assignments: Int[np.ndarray,
 
     A behaviour is missing if no remaining component has any of its trajectories. Errors as for
     :func:`assignment_accuracy`.
+
+    See Also
+    --------
+    i2rl.analysis.assignment_accuracy : how many trajectories the matching has in common
+    i2rl.inference.mme_mtirl : find components
+
+    Examples
+    --------
+    >>> from i2rl.analysis import match_components
+    >>> match_components([0, 0, 1, 1], [5, 5, 3, 5])
+    {0: 5, 1: 3}
+    >>> match_components([0, 0, 1, 1], [5, 5, 5, 5])
+    {0: 5}
     """
     table, behaviours, components = _contingency(labels, assignments)
     pairs = zip(*linear_sum_assignment(table, maximize=True), strict=True)

@@ -126,6 +126,24 @@ def summary(idata: az.InferenceData, **options: Any) -> pd.DataFrame:
     single chain), and ``divergences``: of the chains that the weight was drawn by, NaN where the sampler left
     no statistics. ``options`` as for ``az.summary`` (``hdi_prob``, say). Raises :class:`InferenceDataError`
     for data that are no posterior.
+
+    See Also
+    --------
+    i2rl.analysis.forest_plot : draw the weights
+    i2rl.analysis.trace_plot : draw the chains
+    i2rl.inference.sample_posterior : sample one
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import summary
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_posterior
+    >>> mdp, _, *seen = five_cells()
+    >>> posterior = sample_posterior(jax.random.key(0), mdp, *seen, draws=100, warmup=100, chains=2)
+    >>> table = summary(posterior)
+    >>> list(table.index), bool(table["mean"].iloc[0] > 0), bool((table["r_hat"] < 1.1).all())
+    (['weights[at the end]', 'weights[moves]'], True, True)
     """
     weights = require_posterior(idata, extra=_by_session(idata))
     # Unrounded, ArviZ's columns are of type object.
@@ -187,6 +205,22 @@ def posterior_by_session(
     ------
     DemonstrationError, ValueError
         As there, and ``ValueError`` for sessions that do not exist or do not increase.
+
+    See Also
+    --------
+    i2rl.analysis.weights_by_session : draw it
+    i2rl.inference.sample_posterior : the posterior of everything
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import posterior_by_session
+    >>> from i2rl.domains import five_cells
+    >>> mdp, _, *seen = five_cells()
+    >>> short = dict(draws=100, warmup=100, chains=2)
+    >>> narrowing = posterior_by_session(jax.random.key(0), mdp, *seen, [1, 4, 8], **short)
+    >>> dict(narrowing["posterior"]["weights"].sizes)
+    {'chain': 2, 'draw': 100, 'session': 3, 'feature': 2}
     """
     draws, warmup, chains, target_accept, max_tree_depth = Sampling(**sampling).checked()
     if trajectories < 1:

@@ -53,6 +53,23 @@ def weights_by_session(
     those of an expert who never errs have no such scale, and none of them is ``true_weights`` then.
 
     Raises ``ValueError`` if the true weights or the learner's do not fit.
+
+    See Also
+    --------
+    i2rl.analysis.posterior_by_session : sample it
+    i2rl.analysis.run_history : a learner's estimates beside it
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import posterior_by_session, weights_by_session
+    >>> from i2rl.domains import five_cells
+    >>> mdp, weights, *seen = five_cells()
+    >>> short = dict(draws=100, warmup=100, chains=2)
+    >>> narrowing = posterior_by_session(jax.random.key(0), mdp, *seen, [1, 4, 8], **short)
+    >>> figure = weights_by_session(narrowing, true_weights=weights)
+    >>> [axes.get_title(loc="left") for axes in figure.axes], figure.axes[0].get_xlabel()
+    (['at the end', 'moves'], 'session')
     """
     weights = require_posterior(idata, extra=("session",))
     names, sessions = _names(weights), weights["session"].values
@@ -115,6 +132,23 @@ def forest_plot(
     """Draw each weight: all draws together, and below them every chain on its own; chains should agree.
 
     Points are medians, thick bars hold the middle half of the draws, thin ones the middle ``coverage``.
+
+    See Also
+    --------
+    i2rl.analysis.summary : the same in numbers
+    i2rl.analysis.trace_plot : draw by draw
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import forest_plot
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_posterior
+    >>> mdp, _, *seen = five_cells()
+    >>> posterior = sample_posterior(jax.random.key(0), mdp, *seen, draws=100, warmup=100, chains=2)
+    >>> figure = forest_plot(posterior)
+    >>> figure.axes[0].get_xlabel(), [label.get_text() for label in figure.axes[0].get_yticklabels()]
+    ('weight (nats)', ['at the end', 'moves'])
     """
     weights = require_posterior(idata)
     names, chains = _names(weights, most=60), weights.sizes["chain"]
@@ -141,7 +175,25 @@ def forest_plot(
 
 
 def trace_plot(idata: az.InferenceData, *, theme: Theme = LIGHT, title: str = "") -> Figure:
-    """Draw each weight's density by chain, and its draws in order; divergent ones are ticked."""
+    """Draw each weight's density by chain, and its draws in order; divergent ones are ticked.
+
+    See Also
+    --------
+    i2rl.analysis.rank_plot : whether chains agree
+    i2rl.analysis.summary : the same in numbers
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import trace_plot
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_posterior
+    >>> mdp, _, *seen = five_cells()
+    >>> posterior = sample_posterior(jax.random.key(0), mdp, *seen, draws=100, warmup=100, chains=2)
+    >>> figure = trace_plot(posterior)
+    >>> [axes.get_xlabel() for axes in figure.axes if axes.get_xlabel()]
+    ['weight (nats)', 'draw']
+    """
     weights = require_posterior(idata)
     names, chains = _names(weights, most=_MOST_PANELS), weights.sizes["chain"]
     figure = new_figure(theme, 9.4, 1.1 + 1.15 * len(names))
@@ -212,6 +264,23 @@ def rank_plot(idata: az.InferenceData, *, bins: int = 20, theme: Theme = LIGHT, 
     Every panel has its own scale, up to its highest bar. The band holds 95 % of the counts in one bin for
     independent draws. Raises ``ValueError`` for fewer than
     two bins.
+
+    See Also
+    --------
+    i2rl.analysis.trace_plot : draw by draw
+    i2rl.analysis.summary : R-hat and effective sample sizes
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import rank_plot
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_posterior
+    >>> mdp, _, *seen = five_cells()
+    >>> posterior = sample_posterior(jax.random.key(0), mdp, *seen, draws=100, warmup=100, chains=2)
+    >>> figure = rank_plot(posterior, bins=10)
+    >>> figure.axes[0].get_xlabel()
+    'rank among all draws'
     """
     if bins < 2:
         raise ValueError(f"ranks need at least 2 bins, got {bins}")

@@ -97,6 +97,24 @@ def run_history(
     ------
     ValueError
         For no infos, for infos of a fleet, and for weights that do not fit the learner's MDP.
+
+    See Also
+    --------
+    i2rl.analysis.fleet_history : the same of many streams
+    i2rl.inference.run_sessions : run the sessions
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import run_history
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import lme_i2rl, run_sessions
+    >>> mdp, weights, sensor, demonstration = five_cells()
+    >>> learner = lme_i2rl(mdp, sensor)
+    >>> run = run_sessions(learner, demonstration.sessions(4), key=jax.random.key(0))
+    >>> history = run_history(learner, run, true_weights=weights)
+    >>> history.groups(), dict(history["sessions"]["weights"].sizes)
+    (['constant_data', 'sessions', 'learned'], {'session': 2, 'feature': 2})
     """
     infos, statistic = _infos(run), _statistic_of(run) if statistic is None else statistic
     if np.ndim(infos[0].session) > 0:
@@ -117,6 +135,25 @@ def fleet_history(
 
     ``infos`` are those of consecutive updates of :func:`~i2rl.inference.sessions.fleets.fleet`, ``state`` is
     the fleet's last state. Raises ``ValueError`` as there, and for infos of a single learner.
+
+    See Also
+    --------
+    i2rl.analysis.run_history : the same of one stream
+    i2rl.inference.fleet : map a learner over streams
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import fleet_history
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import fleet, lme_i2rl
+    >>> mdp, _, sensor, demonstration = five_cells()
+    >>> learner = lme_i2rl(mdp, sensor)
+    >>> streams = jax.tree.map(lambda x: x.reshape(2, 4, -1), demonstration)
+    >>> many = fleet(learner)
+    >>> state, info = many.update(many.init(jax.random.key(0), 2), streams)
+    >>> dict(fleet_history(learner, [info], state=state)["sessions"]["weights"].sizes)
+    {'run': 2, 'session': 1, 'feature': 2}
     """
     infos = _infos(infos)
     if np.ndim(infos[0].session) != 1:

@@ -136,6 +136,22 @@ def identifiability_of(
     ValueError
         For discount 1, an empty demonstration, weights of the wrong number or not finite, or a scale that
         is not positive.
+
+    See Also
+    --------
+    i2rl.inference.sample_posterior : the posterior where it is weak
+    i2rl.analysis.select_features : leave a feature out
+
+    Examples
+    --------
+    >>> from i2rl.analysis import identifiability_of
+    >>> from i2rl.domains import five_cells
+    >>> mdp, weights, sensor, demonstration = five_cells()
+    >>> found = identifiability_of(mdp, sensor, demonstration, weights)
+    >>> found.features, len(found.exact), len(found.weak)
+    (('at the end', 'moves'), 0, 0)
+    >>> [bool(error < found.scale) for error in found.standard_errors]
+    [True, True]
     """
     require_discounted(mdp)
     sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)

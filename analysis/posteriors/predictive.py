@@ -56,6 +56,25 @@ def predictive_visits(
         For data that are no posterior, or one of another MDP or sensor.
     ValueError
         For a demonstration without trajectories, or a sensor that does not fit the MDP.
+
+    See Also
+    --------
+    i2rl.analysis.predictive_check : compare the two
+    i2rl.inference.sample_posterior : the posterior
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import predictive_visits
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_posterior
+    >>> mdp, _, *seen = five_cells()
+    >>> posterior = sample_posterior(jax.random.key(0), mdp, *seen, draws=100, warmup=100, chains=2)
+    >>> predicted = predictive_visits(jax.random.key(1), posterior, mdp, seen[0])
+    >>> dict(predicted["posterior_predictive"]["visits"].sizes)
+    {'chain': 2, 'draw': 100, 'visited_state': 5}
+    >>> predicted["observed_data"]["visits"].values[2:4].tolist()
+    [0, 0]
     """
     weights = require_posterior(idata, mdp, sensor)
     sensor = fitting_sensor(sensor, mdp)
@@ -157,6 +176,26 @@ def predictive_check(idata: az.InferenceData, coverage: float = 0.9) -> xr.Datas
 
     Raises :class:`InferenceDataError` without the groups of :func:`predictive_visits`, and ``ValueError``
     for a coverage outside (0, 1).
+
+    See Also
+    --------
+    i2rl.analysis.predictive_visits : predict the visits
+    i2rl.analysis.compare_posteriors : compare models by prediction
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import predictive_check, predictive_visits
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_posterior
+    >>> mdp, _, *seen = five_cells()
+    >>> posterior = sample_posterior(jax.random.key(0), mdp, *seen, draws=100, warmup=100, chains=2)
+    >>> predicted = predictive_visits(jax.random.key(1), posterior, mdp, seen[0])
+    >>> checked = predictive_check(predicted)
+    >>> checked["observed"].values.tolist()
+    [14, 13, 0, 0, 7]
+    >>> bool(checked["discrepancy_p_value"] > 0.05)
+    True
     """
     if not 0 < coverage < 1:
         raise ValueError(f"coverage must lie between 0 and 1, got {coverage}")

@@ -83,6 +83,18 @@ def select_features(mdp: TabularMDP, names: Sequence[str]) -> TabularMDP:
     """Return the same process with only the features of these names, in this order.
 
     Raises ``ValueError`` naming an unknown or repeated feature, or for no names at all.
+
+    See Also
+    --------
+    i2rl.analysis.compare_features : compare such sets
+
+    Examples
+    --------
+    >>> from i2rl.analysis import select_features
+    >>> from i2rl.domains import five_cells
+    >>> mdp = select_features(five_cells().mdp, ["at the end"])
+    >>> mdp.feature_names, mdp.features.shape
+    (('at the end',), (5, 3, 1))
     """
     if not names:
         raise ValueError("select at least one feature")
@@ -122,6 +134,22 @@ def compare_features(
     ValueError
         For fewer than two sets, processes that differ in more than features, fewer than two trajectories with
         evidence; and as :func:`sample_posterior`.
+
+    See Also
+    --------
+    i2rl.analysis.select_features : make a set of features
+    i2rl.analysis.compare_posteriors : compare posteriors at hand
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import compare_features, select_features
+    >>> from i2rl.domains import five_cells
+    >>> mdp, _, *seen = five_cells()
+    >>> sets = {"both": mdp, "moves": select_features(mdp, ["moves"])}
+    >>> short = dict(draws=100, warmup=100, chains=2)
+    >>> compare_features(jax.random.key(0), sets, *seen, **short).best
+    'both'
     """
     _require_same_process(mdps)
     kind = np.asarray(demonstration.kind)
@@ -145,6 +173,26 @@ def compare_posteriors(posteriors: Mapping[str, az.InferenceData]) -> FeatureCom
 
     Raises ``ValueError``, naming the posterior at fault, for fewer than two, one without the group
     ``log_likelihood`` or its variable ``demonstration``, and posteriors of different demonstrations.
+
+    See Also
+    --------
+    i2rl.analysis.compare_features : sample and compare
+    i2rl.inference.sample_posterior : sample a posterior
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import compare_posteriors, select_features
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_posterior
+    >>> mdp, _, *seen = five_cells()
+    >>> short = dict(draws=100, warmup=100, chains=2, completions=False)
+    >>> posteriors = {
+    ...     name: sample_posterior(jax.random.key(0), process, *seen, **short)
+    ...     for name, process in [("both", mdp), ("moves", select_features(mdp, ["moves"]))]
+    ... }
+    >>> list(compare_posteriors(posteriors).table.index)
+    ['both', 'moves']
     """
     if len(posteriors) < 2:
         raise ValueError(f"a comparison needs at least two feature sets, got {len(posteriors)}")

@@ -277,6 +277,21 @@ def adversarial_study(
     Finished runs in ``folder`` are loaded, and new ones are stored there. Raises ``ValueError`` for another
     name than :data:`~i2rl.analysis.studies.adversarial.cases.PLANS` has, and for fewer than one replication
     or session.
+
+    See Also
+    --------
+    i2rl.inference.airl : one of its learners
+    i2rl.inference.robust_airl : another
+    i2rl.domains.load_demonstrations : the experts' episodes
+
+    Examples
+    --------
+    >>> from i2rl.analysis import adversarial_study
+    >>> from i2rl.analysis.studies.adversarial.cases import PLANS
+    >>> quick = PLANS["mountain-car"]._replace(sessions=1, iterations=1, episodes=2)
+    >>> results = adversarial_study("mountain-car", 1, quick, ["AIRL, clean input"])
+    >>> {name: result.returns.shape for name, result in results.methods.items()}
+    {'AIRL, clean input': (1, 1)}
     """
     if replications < 1:
         raise ValueError(f"replications must be at least 1; got {replications}")

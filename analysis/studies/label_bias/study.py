@@ -166,6 +166,19 @@ def label_bias_study(
     The first of ``settings`` is the one that is shown. Raises ``ValueError`` for no world, fewer than four
     trajectories (their correlation has no interval), no setting, and where no world of the first setting has
     a correlation.
+
+    See Also
+    --------
+    i2rl.domains.random_object_world : one of its worlds
+    i2rl.inference.birl : the learner it is about
+
+    Examples
+    --------
+    >>> from i2rl.analysis import label_bias_study
+    >>> from i2rl.analysis.studies.label_bias.study import FIRST
+    >>> study = label_bias_study(3, 20, settings=[FIRST], rationalities=[1.0])
+    >>> [result.setting.name for result in study.results], study.results[0].birl.shape
+    (['Boltzmann experts, eta 1'], (3,))
     """
     if worlds < 1 or trajectories < 4 or not settings:
         raise ValueError(

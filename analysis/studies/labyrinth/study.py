@@ -189,6 +189,22 @@ def labyrinth_study(
         decision of the learner.
 
     Raises ``ValueError`` for an empty recording or a discount outside (0, 1).
+
+    See Also
+    --------
+    i2rl.domains.simulate_bouts : bouts to learn from
+    i2rl.domains.read_bouts : read recorded ones
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import labyrinth_study
+    >>> from i2rl.domains import mouse_labyrinth, simulate_bouts
+    >>> maze = mouse_labyrinth()
+    >>> bouts = simulate_bouts(jax.random.key(0), maze, jax.numpy.zeros(maze.mdp.n_features), 3, max_steps=64)
+    >>> predictions = labyrinth_study(bouts, hide_left=False).views[0].predictions
+    >>> predictions[0].bits.shape, [prediction.method for prediction in predictions[:3]]
+    ((3,), ['i2rl', 'i2rl, by level', 'uniform'])
     """
     if not bouts:
         raise ValueError("the recording has no bouts")

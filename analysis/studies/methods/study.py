@@ -175,6 +175,20 @@ def methods_study(
     :class:`MethodsStudy`) on one further run, drawn for this and used for nothing else.
     ``methods`` names some of the methods, all by default. Raises ``ValueError`` for an instance or a method
     that does not exist.
+
+    See Also
+    --------
+    i2rl.analysis.patrol_study : the same patrols, partly hidden
+    i2rl.inference.me_i2rl : one of the methods
+
+    Examples
+    --------
+    >>> from i2rl.analysis import methods_study
+    >>> study = methods_study(2, sessions=4, runs=1, methods=["ME-I2RL, features"])
+    >>> [curve.name for curve in study.curves], study.points.tolist()
+    (['ME-I2RL, features'], [5, 10, 15, 20])
+    >>> study.curves[0].accuracy.shape
+    (2, 4)
     """
     patrol = instance(number)
     entries = _entries(patrol)

@@ -454,6 +454,18 @@ def noisy_study(
     ------
     ValueError
         For a task or method that does not exist, other starts, and numbers below one.
+
+    See Also
+    --------
+    i2rl.domains.demonstrate_noisy : its streams
+    i2rl.inference.rimeo : its learner
+
+    Examples
+    --------
+    >>> from i2rl.analysis import noisy_study
+    >>> study = noisy_study("sorting", runs=1, sessions=2, belts=10, draws=0, methods=[])
+    >>> list(study.results), study.true_agreement.shape
+    (['RIMEO, no scores'], (8,))
     """
     belts, draws = Examples(**examples)
     if name not in TASKS:

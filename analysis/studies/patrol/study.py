@@ -168,6 +168,20 @@ def patrol_study(
     of policies then tries ``trials`` breaches, with the time it took to learn on the clock. ``methods`` names
     some of ``lme-i2rl``, ``batch`` and ``random`` (all by default). Raises ``ValueError`` for an instance,
     observability or method that does not exist.
+
+    See Also
+    --------
+    i2rl.analysis.methods_study : methods in full view
+    i2rl.domains.breach_trials : the breaches alone
+
+    Examples
+    --------
+    >>> from i2rl.analysis import patrol_study
+    >>> study = patrol_study(2, sessions=2, trials=5, runs=1, methods=["random"])
+    >>> [result.name for result in study.methods]
+    ['random weights', 'true policy']
+    >>> study.methods[-1].breach.ended.shape
+    (5,)
     """
     patrol = instance(number)
     observability = patrol.observability if observability is None else observability

@@ -211,6 +211,19 @@ def sorting_study(
     ------
     ValueError
         For numbers that make no study, saying which.
+
+    See Also
+    --------
+    i2rl.domains.demonstrate_sorting : its trajectories
+    i2rl.inference.mme_mtirl : its online learner
+    i2rl.analysis.expected_value_difference : its measure
+
+    Examples
+    --------
+    >>> from i2rl.analysis import sorting_study
+    >>> study = sorting_study(2, [4], runs=1, methods=["em-mlirl"], steps=10, belts=10)
+    >>> [(result.name, result.trajectories.tolist()) for result in study.results]
+    [('EM-MLIRL', [4])]
     """
     replications, seed, steps, belts = plan = Design(**design)
     _check(tasks, counts, plan, methods, sessions, n_components)
