@@ -14,7 +14,7 @@ run: $(READY)
 	$(BIN)/i2rl run patrol
 
 test: $(READY)
-	OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -q tests
+	PYTHONHASHSEED=0 OPENBLAS_NUM_THREADS=1 $(BIN)/pytest -n 2 --dist loadfile -q tests
 
 lint: $(READY)
 	$(BIN)/ruff check .

@@ -120,7 +120,7 @@ def sensor_identification(
     >>> from i2rl.inference import sensor_identification
     >>> corridor = five_cells()
     >>> predicates = np.indices((5, 3))  # the cell and the action of each pair
-    >>> options = {"view": corridor.sensor, "scores": "none"}
+    >>> options = {"visibility": corridor.sensor, "scores": "none"}
     >>> found = sensor_identification(
     ...     corridor.mdp, predicates, corridor.demonstration, corridor.weights, **options
     ... )
@@ -134,33 +134,34 @@ def sensor_identifier(
     mdp: TabularMDP,
     predicates: ArrayLike,
     *,
-    view: AnySensor | None = None,
+    visibility: AnySensor | None = None,
     reportable: ArrayLike | None = None,
     scores: str = "stepwise",
-    errors: float = 0.25,
+    observation_slack: float = 0.25,
     tolerance: float = 0.05,
 ) -> Callable[[Demonstration, ArrayLike], SensorIdentification]:
     """Build :func:`sensor_identification` for many demonstrations, compiled once for each of their shapes.
 
-    ``view``, ``reportable``, ``scores`` and ``errors`` are those of :func:`~i2rl.inference.rimeo`; predicates
-    whose agreement differs by at most ``tolerance`` count as identified.
+    ``visibility``, ``reportable``, ``scores`` and ``observation_slack`` are those of
+    :func:`~i2rl.inference.rimeo`; predicates whose agreement differs by at most ``tolerance`` count as
+    identified.
     """
     if scores not in ("stepwise", "averaged", "none"):
         raise ValueError(f"scores must be one of stepwise, averaged, none, got {scores!r}")
-    if not 0 <= errors < np.inf:
-        raise ValueError(f"errors must be a number of reports, not negative, got {errors}")
+    if not 0 <= observation_slack < np.inf:
+        raise ValueError(f"errors must be a number of reports, not negative, got {observation_slack}")
     psi = np.asarray(predicates)
     if psi.ndim != 3 or psi.shape[1:] != mdp.available.shape:
         raise ValueError(
             f"predicates have shape [J, S, A] = [J, {mdp.n_states}, {mdp.n_actions}], got {list(psi.shape)}"
         )
-    seen: AnySensor = Sensor() if view is None else Sensor() * view
+    seen: AnySensor = Sensor() if visibility is None else Sensor() * visibility
     if seen.noise is not None:
-        raise ValueError("the view says what is hidden; how reports err is fitted, not given")
+        raise ValueError("the visibility says what is hidden; how reports err is fitted, not given")
     seen = fitting_sensor(seen, mdp)
     mask = None if reportable is None else np.asarray(reportable, bool)
     classes = report_classes(psi, mask)
-    perception = entropic_perception(classes, scores, "posterior", errors, 1.0)
+    perception = entropic_perception(classes, scores, "posterior", observation_slack, 1.0)
     fit = _fit(mdp, perception, seen.visibility, initial_logits(psi, DEFAULT_START))
     slips = mdp.available / mdp.available.sum(1, keepdims=True)
 
@@ -212,10 +213,10 @@ def _fit(
             evidence = report_log_evidence(
                 perception.classes, logits, session.reports, confidence, visibility
             )
-            truths = smooth_all(mdp, log_policy, Evidence(evidence, session.live))
-            heard = perception.summarise(logits, session, confidence, truths.pairs)
+            completion = smooth_all(mdp, log_policy, Evidence(evidence, session.live))
+            heard = perception.summarise(logits, session, confidence, completion.pairs)
             logits = perception.fit(heard, logits)
-            return logits, perception.agreement(logits, heard), truths.log_likelihood
+            return logits, perception.agreement(logits, heard), completion.log_likelihood
 
         begun = first_logits, jnp.zeros_like(first_logits), jnp.zeros(len(session.live))
         return lax.fori_loop(0, _ITERATIONS, step, begun)[1:]

@@ -59,12 +59,12 @@ from .alternation import Alternation, Method, checked_method, newton, random_wei
 from .lme import Batch, batch_lme
 
 Scores = Literal["stepwise", "averaged", "none"]
-Truths = Literal["posterior", "observed", "oracle", "all"]
+Completions = Literal["posterior", "observed", "oracle", "all"]
 
 # Nats in all. Rewards that grow early bias the interpretation of early observations.
 DEFAULT_RIDGE = 0.05
 # Number of observations, per predicate: agreement is learned as if a quarter of one had been wrong.
-DEFAULT_ERRORS = 0.25
+DEFAULT_OBSERVATION_SLACK = 0.25
 # Sessions are small: one or two alternations are enough for each, and more overfit their completions.
 DEFAULT_ITERATIONS = 2
 # Exponent of forgetting early completions.
@@ -159,9 +159,9 @@ class RIMEOSettings(NamedTuple):
     iterations: int = DEFAULT_ITERATIONS
     tolerance: float = 1e-3
     scores: Scores = "stepwise"
-    truths: Truths = "posterior"
+    completion: Completions = "posterior"
     unscored: bool = False
-    errors: float = DEFAULT_ERRORS
+    observation_slack: float = DEFAULT_OBSERVATION_SLACK
     start: ArrayLike = DEFAULT_START
 
 
@@ -169,9 +169,9 @@ class RIMEOOptions(RIFOMOptions, total=False):
     """:class:`RIMEOSettings` as keyword arguments."""
 
     scores: Scores
-    truths: Truths
+    completion: Completions
     unscored: bool
-    errors: float
+    observation_slack: float
     start: ArrayLike
 
 
@@ -179,7 +179,7 @@ def rimeo(
     mdp: TabularMDP,
     predicates: ArrayLike,
     *,
-    view: AnySensor | None = None,
+    visibility: AnySensor | None = None,
     solver: str = "newton",
     statistic: str = "seen",
     slack: Schedule = 0.0,
@@ -197,7 +197,7 @@ def rimeo(
         Features of a pair that perception may get wrong. Only the equality of an observation's and the
         truth's value counts, so a feature may be a label, such as the state. With predicates alone,
         perception may confuse all pairs that they do not distinguish.
-    view : Sensor, optional
+    visibility : Sensor, optional
         A ``Visibility``; everything is in view by default.
     solver : {"newton", "ipopt"}
         Both programs in compiled JAX, or in CasADi, each started from its last solution.
@@ -209,13 +209,13 @@ def rimeo(
         Perception's probability of being right enters step by step, as the running average of each observed
         pair (Eq. 6.6), or not at all. An average does not say which observation was doubtful, so the first is
         the default.
-    truths : {"posterior", "observed", "oracle", "all"}
+    completion : {"posterior", "observed", "oracle", "all"}
         Truths to compare observations with: the posterior over the truth; the observation itself; the actual
         truth (sessions must then be :class:`WithTruth`); every pair alike, as Eq. 6.7 is printed.
     unscored : bool
         Allow observations without a score if ``scores`` are used: they inform agreement as all observations
         do with ``scores="none"``; False by default.
-    errors : float
+    observation_slack : float
         Slack of the observation program: expected agreement may be off by this number of observations in all
         (0.25 by default). It keeps the reliability of a predicate that was never wrong below one.
     start : float or float ``[J]``
@@ -260,52 +260,52 @@ def rimeo(
     >>> from i2rl.inference import rimeo
     >>> corridor = five_cells()
     >>> predicates = np.indices((5, 3))  # the cell and the action of each pair
-    >>> learner = rimeo(corridor.mdp, predicates, view=corridor.sensor, scores="none")
+    >>> learner = rimeo(corridor.mdp, predicates, visibility=corridor.sensor, scores="none")
     >>> state, info = learner.update(learner.init(jax.random.key(0)), corridor.demonstration)
     >>> learner.name, info.reliabilities.shape, bool((info.agreement > 0.5).all())  # mostly right
     ('RIMEO', (2,), True)
     """
     chosen = RIMEOSettings(**settings)
     reportable, names, forgetting, iterations, tolerance = chosen[:5]
-    scores, truths, unscored, errors, start = chosen[5:]
-    seen = _checked_view(mdp, view, slack)
+    scores, completion, unscored, observation_slack, start = chosen[5:]
+    seen = _checked_view(mdp, visibility, slack)
     psi = _checked_predicates(mdp, predicates, reportable, names)
     for name, value, options in (
         ("scores", scores, ("stepwise", "averaged", "none")),
-        ("truths", truths, ("posterior", "observed", "oracle", "all")),
+        ("completion", completion, ("posterior", "observed", "oracle", "all")),
         ("solver", solver, ("newton", "ipopt")),
     ):
         if value not in options:
             raise ValueError(f"{name} must be one of {', '.join(options)}, got {value!r}")
-    if not 0 <= errors < np.inf:
-        raise ValueError(f"errors must be a number of reports, not negative, got {errors}")
+    if not 0 <= observation_slack < np.inf:
+        raise ValueError(f"errors must be a number of reports, not negative, got {observation_slack}")
     classes = report_classes(psi, reportable)
-    if truths == "all":
+    if completion == "all":
         if scores == "none":
-            raise ValueError("the printed program (truths='all') is made of scores, got scores='none'")
+            raise ValueError("the printed program (completion='all') is made of scores, got scores='none'")
         if psi.dtype != bool:
-            raise ValueError("the printed program (truths='all') needs predicates that are true or false")
+            raise ValueError("the printed program (completion='all') needs predicates that are true or false")
         perception = printed_perception(classes, psi, np.asarray(mdp.available))
     else:
         program = ObservationProgram(psi, reportable) if solver == "ipopt" else None
-        perception = entropic_perception(classes, scores, truths, errors, forgetting, program)
+        perception = entropic_perception(classes, scores, completion, observation_slack, forgetting, program)
     configuration = {
         "scores": scores,
-        "truths": truths,
+        "completion": completion,
         "unscored": unscored,
         "solver": solver,
         "statistic": statistic,
         "slack": described(slack),
         "ridge": ridge,
-        "errors": errors,
+        "observation_slack": observation_slack,
         "forgetting": forgetting,
         "start": np.asarray(start, float).tolist(),
         "iterations": iterations,
         "tolerance": tolerance,
-        "view": digest_of(seen),
+        "visibility": digest_of(seen),
         "predicates": digest_of(_half_sure(psi, reportable)),
     }
-    name = "RIMEO" if truths == "posterior" else f"RIMEO ({truths})"
+    name = "RIMEO" if completion == "posterior" else f"RIMEO ({completion})"
     first_logits = initial_logits(psi, start)
 
     def build(mdp: TabularMDP) -> Learner:
@@ -330,7 +330,7 @@ def rifom(
     predicates: ArrayLike,
     *,
     form: Literal["fair", "coded"] = "fair",
-    view: AnySensor | None = None,
+    visibility: AnySensor | None = None,
     statistic: str = "seen",
     slack: Schedule = 0.0,
     ridge: float = DEFAULT_RIDGE,
@@ -355,13 +355,13 @@ def rifom(
     >>> from i2rl.inference import rifom
     >>> corridor = five_cells()
     >>> predicates = np.indices((5, 3))  # the cell and the action of each pair
-    >>> learner = rifom(corridor.mdp, predicates, view=corridor.sensor)
+    >>> learner = rifom(corridor.mdp, predicates, visibility=corridor.sensor)
     >>> state, info = learner.update(learner.init(jax.random.key(0)), corridor.demonstration)
     >>> learner.name, info.reliabilities.shape
     ('RIFOM (fair)', (2,))
     """
     reportable, names, forgetting, iterations, tolerance = RIFOMSettings(**settings)
-    seen = _checked_view(mdp, view, slack)
+    seen = _checked_view(mdp, visibility, slack)
     psi = _checked_predicates(mdp, predicates, reportable, names)
     if form not in ("fair", "coded"):
         raise ValueError(f"form must be fair or coded, got {form!r}")
@@ -377,7 +377,7 @@ def rifom(
         "forgetting": forgetting,
         "iterations": iterations,
         "tolerance": tolerance,
-        "view": digest_of(seen),
+        "visibility": digest_of(seen),
         "predicates": digest_of(_half_sure(psi, reportable)),
     }
     first_logits = initial_logits(psi, DEFAULT_START)
@@ -430,12 +430,12 @@ def robust_irl(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Batch:
 # -- building blocks ----------------------------------------------------------------------------------
 
 
-def _checked_view(mdp: TabularMDP, view: AnySensor | None, slack: Schedule) -> AnySensor:
+def _checked_view(mdp: TabularMDP, visibility: AnySensor | None, slack: Schedule) -> AnySensor:
     require_discounted(mdp)
     require_slack(slack)
-    seen = Sensor() if view is None else Sensor() * view
+    seen = Sensor() if visibility is None else Sensor() * visibility
     if seen.noise is not None:
-        raise ValueError("the view says what is hidden; how reports err is learned, not given")
+        raise ValueError("the visibility says what is hidden; how reports err is learned, not given")
     return fitting_sensor(seen, mdp)
 
 
@@ -663,7 +663,7 @@ def _learner(
     def update(state: RIMEOState, demonstration: Any) -> tuple[RIMEOState, RIMEOInfo]:
         began = time.perf_counter()
         seen = _checked_session(
-            mdp, name, demonstration, scores_needed, configuration.get("truths") == "oracle"
+            mdp, name, demonstration, scores_needed, configuration.get("completion") == "oracle"
         )
         if isinstance(demonstration, WithTruth):
             _require_truth(mdp, demonstration)

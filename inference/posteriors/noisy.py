@@ -49,7 +49,7 @@ class NoisyProblem(NamedTuple):
     mdp: TabularMDP
     predicates: Bool[Array, "J S A"] | Int[Array, "J S A"]
     reportable: Bool[Array, "S A"]
-    view: Sensor
+    visibility: Sensor
     codes: Int[Array, "u L 3"]
     repeats: Int[Array, " u"]
     prior: dist.Distribution
@@ -78,7 +78,7 @@ def _constrained(position: Float[Array, " D"], problem: NoisyProblem) -> dict[st
 def noisy_potential(position: Float[Array, " D"], problem: NoisyProblem) -> Float[Array, ""]:
     """Return the negative log-density of the model at unconstrained weights, then reliabilities."""
     options = {
-        "view": problem.view,
+        "visibility": problem.visibility,
         "reportable": problem.reportable,
         "prior": problem.prior,
         "reliability_prior": problem.reliability_prior,
@@ -180,7 +180,7 @@ def noisy_log_likelihood(
     """Return the log-likelihood of each distinct trajectory under every draw."""
 
     def one(draw: tuple) -> Float[Array, " u"]:
-        sensor = FeatureNoise(problem.predicates, draw[1], problem.reportable) * problem.view
+        sensor = FeatureNoise(problem.predicates, draw[1], problem.reportable) * problem.visibility
         return TrajectoryLaw(problem.mdp, draw[0], sensor, problem.codes.shape[1]).log_prob(problem.codes)
 
     # One draw at a time: linear solves do not batch, and evidence is [u, L, S, A] for each draw.
@@ -192,7 +192,7 @@ def noisy_problem(
     predicates: ArrayLike,
     demonstration: Demonstration,
     *,
-    view: AnySensor | None = None,
+    visibility: AnySensor | None = None,
     reportable: ArrayLike | None = None,
     prior: dist.Distribution | None = None,
     reliability_prior: dist.Distribution | None = None,
@@ -209,7 +209,7 @@ def noisy_problem(
     noise = FeatureNoise(
         psi, np.full(psi.shape[:1], 0.5), None if reportable is None else np.asarray(reportable)
     )
-    seen = Sensor() if view is None else Sensor() * view
+    seen = Sensor() if visibility is None else Sensor() * visibility
     # The reportable pairs do not depend on the reliabilities.
     require_possible(noise * seen, mdp, demonstration)
     gathered, rows = gather(mdp, seen, demonstration, prior)
@@ -240,7 +240,7 @@ def sample_noisy_posterior(
     predicates: ArrayLike,
     demonstration: Demonstration,
     *,
-    view: AnySensor | None = None,
+    visibility: AnySensor | None = None,
     reportable: ArrayLike | None = None,
     prior: dist.Distribution | None = None,
     reliability_prior: dist.Distribution | None = None,
@@ -257,7 +257,7 @@ def sample_noisy_posterior(
     Parameters
     ----------
     key : JAX random key
-    mdp, predicates, demonstration, view, reportable, prior, reliability_prior
+    mdp, predicates, demonstration, visibility, reliability_prior
         Arguments of the model. Scores are ignored.
     names : tuple of str, optional
         Names of the predicates; ``psi1``, ``psi2``, ... by default.
@@ -296,7 +296,7 @@ def sample_noisy_posterior(
     >>> mdp, _, view, demonstration = five_cells()
     >>> predicates = np.indices((5, 3))  # the cell and the action of each pair
     >>> data = sample_noisy_posterior(
-    ...     jax.random.key(0), mdp, predicates, demonstration, view=view, draws=20, warmup=20, chains=1
+    ...     jax.random.key(0), mdp, predicates, demonstration, visibility=view, draws=20, warmup=20, chains=1
     ... )
     >>> dict(data.posterior["reliabilities"].sizes)
     {'chain': 1, 'draw': 20, 'predicate': 2}
@@ -307,7 +307,7 @@ def sample_noisy_posterior(
         mdp,
         predicates,
         demonstration,
-        view=view,
+        visibility=visibility,
         reportable=reportable,
         prior=prior,
         reliability_prior=reliability_prior,
@@ -334,7 +334,7 @@ def sample_noisy_posterior(
         "inference": "NUTS over weights and reliabilities, truths summed out",
         "mdp_fingerprint": mdp.fingerprint(),
         "predicates_fingerprint": fingerprint((problem.predicates, problem.reportable)),
-        "sensor_fingerprint": fingerprint(problem.view),
+        "sensor_fingerprint": fingerprint(problem.visibility),
         "prior": described_prior(problem.prior),
         "reliability_prior": described_prior(problem.reliability_prior),
         "key": str(np.asarray(jax.random.key_data(key)).tolist()),

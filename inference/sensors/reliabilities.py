@@ -142,8 +142,8 @@ class Perception(NamedTuple):
 def entropic_perception(
     classes: ReportClasses,
     scores: str,
-    truths: str,
-    errors: float,
+    completion: str,
+    observation_slack: float,
     forgetting: float,
     program: ObservationProgram | None = None,
 ) -> Perception:
@@ -152,16 +152,16 @@ def entropic_perception(
     def summarise(
         logits: Array, session: PreparedSession, confidence: Array, pairs: Array
     ) -> ReportStatistic:
-        if truths == "observed":
+        if completion == "observed":
             same = session.reports.same.astype(float)
             pairs = same / jnp.maximum(same.sum((2, 3), keepdims=True), 1.0)
-        elif truths == "oracle":
+        elif completion == "oracle":
             assert session.truth is not None
             pairs = session.truth
         return report_statistic(classes, logits, session.reports, confidence, pairs)
 
     def slack(statistic: ReportStatistic) -> Array:
-        return errors / jnp.maximum(statistic.size, 1.0)
+        return observation_slack / jnp.maximum(statistic.size, 1.0)
 
     def fit(statistic: ReportStatistic, logits: Array) -> Array:
         fitted = fit_sensor(classes, statistic, slack(statistic), logits).logits

@@ -74,7 +74,7 @@ def noisy_behaviour_model(
     predicates: Bool[Array, "J S A"] | Int[Array, "J S A"],
     codes: Int[Array, "n L 3"] | None = None,
     *,
-    view: AnySensor | None = None,
+    visibility: AnySensor | None = None,
     reportable: Bool[Array, "S A"] | None = None,
     n_trajectories: int | None = None,
     length: int | None = None,
@@ -95,7 +95,7 @@ def noisy_behaviour_model(
     codes : int ``[n, L, 3]``, optional
         Observations, :attr:`Demonstration.codes` (scores are not part of the event). Without them the model
         simulates, as :func:`occlusion_model` does.
-    view : Sensor, optional
+    visibility : Sensor, optional
         A :class:`Visibility` that hides steps besides; none by default.
     reportable : bool ``[S, A]``, optional
         As in ``FeatureNoise``.
@@ -143,7 +143,9 @@ def noisy_behaviour_model(
     reliabilities = numpyro.sample(
         "reliabilities", reliabilities_prior(predicates.shape[0], reliability_prior)
     )
-    sensor = FeatureNoise(predicates, reliabilities, reportable) * (Sensor() if view is None else view)
+    sensor = FeatureNoise(predicates, reliabilities, reportable) * (
+        Sensor() if visibility is None else visibility
+    )
     law = TrajectoryLaw(mdp, weights, sensor, length)
     with numpyro.plate("trajectory", n_trajectories), scaled(scale=1.0 if repeats is None else repeats):
         return numpyro.sample("demonstration", law, obs=codes)

@@ -36,7 +36,13 @@ from ....domains.noisy.tasks import NoisyTask, demonstrate_noisy, noisy_patrol, 
 from ....domains.object_world.process import random_object_world
 from ....inference.completion.smoothing import Evidence, smooth_all
 from ....inference.learners.alternation import checked_method, newton
-from ....inference.learners.noisy import DEFAULT_ERRORS, DEFAULT_FORGETTING, DEFAULT_RIDGE, rifom, rimeo
+from ....inference.learners.noisy import (
+    DEFAULT_FORGETTING,
+    DEFAULT_OBSERVATION_SLACK,
+    DEFAULT_RIDGE,
+    rifom,
+    rimeo,
+)
 from ....inference.programs.maximum_entropy import WarmStart
 from ....inference.sensors.observations import (
     fit_sensor,
@@ -212,7 +218,9 @@ def part_seconds(task: NoisyTask, sessions: int = 20, replications: int = 200) -
     for one in stream.seen.sessions(stream.trajectories):
         state, _ = learner.update(state, one)
     method = checked_method(mdp, Sensor(), "seen", "exact", 0.0, DEFAULT_RIDGE, 0)
-    perception = entropic_perception(classes, "stepwise", "posterior", DEFAULT_ERRORS, DEFAULT_FORGETTING)
+    perception = entropic_perception(
+        classes, "stepwise", "posterior", DEFAULT_OBSERVATION_SLACK, DEFAULT_FORGETTING
+    )
     session = prepare(mdp, classes, one.bucketed(), True)
     confidence = session.reports.score[..., None, None]
     plan = method.plan(state.weights, state.values)

@@ -74,7 +74,7 @@ class SensorPosterior(NamedTuple):
 def sensor_posterior(
     key: Array,
     task: NoisyTask,
-    shown: NoisyDemonstration,
+    demonstrated: NoisyDemonstration,
     learned: Float[np.ndarray, " J"],
     pairs: Float[np.ndarray, "S A"],
     *,
@@ -88,18 +88,20 @@ def sensor_posterior(
     which is no :class:`FeatureNoise`.
     """
     data = sample_noisy_posterior(
-        key, shown.mdp, task.features, shown.seen, draws=draws, warmup=warmup, chains=2
+        key, demonstrated.mdp, task.features, demonstrated.seen, draws=draws, warmup=warmup, chains=2
     )
     reliabilities = np.asarray(data["posterior"]["reliabilities"]).reshape(-1, len(task.features))
     agreement = np.asarray(_agreement(jnp.asarray(task.features), jnp.asarray(pairs), reliabilities))
-    reports, pairs_done = (task.features[:, d.state, d.action] for d in (shown.seen, shown.truth))
+    reports, pairs_done = (
+        task.features[:, d.state, d.action] for d in (demonstrated.seen, demonstrated.truth)
+    )
     return SensorPosterior(
         task.feature_names,
         agreement,
         np.asarray(learned),
         agreement_probabilities(task.noise, task.features, pairs),
         (reports == pairs_done).mean((1, 2)),
-        shown.seen.n_trajectories,
+        demonstrated.seen.n_trajectories,
         int(np.asarray(data["sample_stats"]["diverging"]).sum()),
         np.asarray(data["posterior"]["weights"]).reshape(len(reliabilities), -1),
     )

@@ -273,11 +273,11 @@ LEARNERS: Mapping[str, _Entry] = {
     AVERAGED: _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="averaged")),
     STEPWISE: _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="stepwise")),
     BARE: _Entry(lambda mdp, task: rimeo(mdp, task.predicates, scores="none")),
-    ORACLE: _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="none", truths="oracle"), "both"),
-    OBSERVED: _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="none", truths="observed")),
+    ORACLE: _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="none", completion="oracle"), "both"),
+    OBSERVED: _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="none", completion="observed")),
     FAIR: _Entry(lambda mdp, task: rifom(mdp, task.features)),
     CODED: _Entry(lambda mdp, task: rifom(mdp, task.predicates, form="coded")),
-    ALL: _Entry(lambda mdp, task: rimeo(mdp, task.predicates, truths="all")),
+    ALL: _Entry(lambda mdp, task: rimeo(mdp, task.predicates, completion="all")),
     KNOWN: _Entry(lambda mdp, task: _plain_learner(mdp, task.noise), perceives=False),
     CLEAR: _Entry(lambda mdp, task: _plain_learner(mdp, Sensor()), "truth", perceives=False),
 }
@@ -545,7 +545,9 @@ def _hidden(
     draw, learn = jax.random.split(key)
     # Until something is seen there is no agreement to judge.
     clear = _Entry(lambda mdp, task: _plain_learner(mdp, view), perceives=False)
-    noisy = _Entry(lambda mdp, task: rimeo(mdp, task.features, scores="none", view=view), perceives=False)
+    noisy = _Entry(
+        lambda mdp, task: rimeo(mdp, task.features, scores="none", visibility=view), perceives=False
+    )
     results = {}
     for method, noise, entry in ((HIDDEN, noisy_patrol(0.0).noise, clear), (BOTH, judge.task.noise, noisy)):
         streams = draw_streams(

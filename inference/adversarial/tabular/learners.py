@@ -187,26 +187,26 @@ def robust_airl_with_learned_sensor(
     mdp: TabularMDP,
     assumed: ConfusionNoise,
     *,
-    view: AnySensor | None = None,
+    visibility: AnySensor | None = None,
     trust: float = 2.0,
     **options: Any,
 ) -> Learner:
     """Build robust-AIRL that learns the probability of each confusion, by expectation-maximisation.
 
     ``assumed`` lists the possible confusions; its probabilities are the starting point, and count as
-    ``trust`` observations of each. ``view`` is the sensor's visibility. Other options as for
+    ``trust`` observations of each. ``visibility`` is the sensor's visibility. Other options as for
     :func:`robust_airl_tabular`.
     """
     if not trust > 0:
         raise ValueError(f"trust in the assumed probabilities must be positive, got {trust}")
-    view = None if view is None else fitting_sensor(view, mdp)
-    if view is not None and view.noise is not None:
-        raise ValueError("the view says what is hidden; how reports err is learned, not given")
+    visibility = None if visibility is None else fitting_sensor(visibility, mdp)
+    if visibility is not None and visibility.noise is not None:
+        raise ValueError("the visibility says what is hidden; how reports err is learned, not given")
     noise = np.asarray(assumed.chances)
     for m in np.flatnonzero(~((noise > 0) & (noise < 1))):
         raise ValueError(f"learning starts from probabilities in (0, 1); that of confusion {m} is {noise[m]}")
-    sensor = fitting_sensor(Sensor(None if view is None else view.visibility, assumed.noise), mdp)
-    known: Any = (assumed, view)
+    sensor = fitting_sensor(Sensor(None if visibility is None else visibility.visibility, assumed.noise), mdp)
+    known: Any = (assumed, visibility)
     settings = {"truth": "exact, sensor learned", "trust": trust, "sensor": digest_of(known)}
     look = _Look(_exact(mdp), np.asarray(mdp.successors), sensor, assumed, trust)
     return _learner("robust-AIRL, sensor learned", mdp, look, tabular_airl, _AIRL, options, settings)

@@ -68,7 +68,7 @@ def test_what_does_not_fit_is_refused():
     with pytest.raises(ValueError, match="scores must be one of"):
         sensor_identification(shown.mdp, task.features, shown.seen, weights, scores="some")
     with pytest.raises(ValueError, match="fitted, not given"):
-        sensor_identification(shown.mdp, task.features, shown.seen, weights, view=task.noise)
+        sensor_identification(shown.mdp, task.features, shown.seen, weights, visibility=task.noise)
     lost = replace(shown.seen, kind=np.full_like(shown.seen.kind, LOST))
     with pytest.raises(DemonstrationError, match="nothing was reported"):
         sensor_identification(shown.mdp, task.features, lost, weights)

@@ -36,8 +36,8 @@ def learned_with(scores):
 
 @cache
 def learned_half_hidden(solver):
-    mdp, view = stream()[0], Visibility(np.full(22, 0.5))
-    return rimeo(mdp, task().features, view=view, scores="none", solver=solver), view
+    mdp, visibility = stream()[0], Visibility(np.full(22, 0.5))
+    return rimeo(mdp, task().features, visibility=visibility, scores="none", solver=solver), visibility
 
 
 @cache
@@ -71,7 +71,7 @@ def test_the_sensor_is_learned_far_better_than_a_guess_of_one_half(scores):
 
 def test_knowing_the_truth_is_the_upper_bound_of_the_alternation():
     mdp, seen, truth = stream()
-    oracle = rimeo(mdp, task().features, scores="none", truths="oracle")
+    oracle = rimeo(mdp, task().features, scores="none", completion="oracle")
     run = run_sessions(oracle, map(WithTruth, seen, truth), key=KEY)
     reports, happened = concatenate(seen), concatenate(truth)
     psi = task().features
@@ -85,7 +85,14 @@ def test_alternations_climb_the_exact_likelihood_of_the_reports():
     everything = concatenate(seen)
     psi = task().features
     learner = rimeo(
-        mdp, psi, scores="none", statistic="counts", iterations=1, tolerance=0.0, errors=0.0, ridge=0.01
+        mdp,
+        psi,
+        scores="none",
+        statistic="counts",
+        iterations=1,
+        tolerance=0.0,
+        observation_slack=0.0,
+        ridge=0.01,
     )
     start = learner.init(KEY)
     values = []
@@ -106,7 +113,9 @@ def test_with_a_reliable_sensor_it_is_online_maximum_entropy_irl():
     mdp, _, truth = stream()
     identity = np.arange(mdp.n_states * mdp.n_actions).reshape(1, mdp.n_states, mdp.n_actions)
     settings = {"slack": 0.0, "ridge": 0.1, "iterations": 30, "tolerance": 1e-8}
-    ours = rimeo(mdp, identity, scores="none", start=1 - 1e-6, errors=0.0, forgetting=1.0, **settings)
+    ours = rimeo(
+        mdp, identity, scores="none", start=1 - 1e-6, observation_slack=0.0, forgetting=1.0, **settings
+    )
     theirs = lme_i2rl(mdp, Sensor(), **settings)
     a, b = (run_sessions(x, truth, key=KEY).state.weights for x in (ours, theirs))
     np.testing.assert_allclose(a, b, atol=1e-3)
@@ -121,7 +130,7 @@ def test_a_score_of_nearly_one_makes_reports_the_truth():
 
 def test_what_is_hidden_as_well_is_summed_out():
     mdp, seen, _ = stream()
-    learner, view = learned_half_hidden("newton")
+    learner, visibility = learned_half_hidden("newton")
     hidden = np.random.default_rng(0).random((2, 3)) < 0.5
     hidden[0, 0] = False
     partly = [
@@ -136,7 +145,7 @@ def test_what_is_hidden_as_well_is_summed_out():
     ]
     state, report = learner.update(learner.init(KEY), partly[0])
     noise = FeatureNoise(task().features, np.asarray(jax.nn.sigmoid(state.logits)))
-    law = TrajectoryLaw(mdp, state.weights, noise * view, 3)
+    law = TrajectoryLaw(mdp, state.weights, noise * visibility, 3)
     np.testing.assert_allclose(
         report.demonstration_log_likelihood, np.sum(law.log_prob(jnp.asarray(partly[0].codes))), rtol=1e-9
     )
@@ -232,9 +241,9 @@ def test_the_moving_window_stops_a_stream_that_has_settled():
 
 def test_taking_reports_for_truths_ends_in_believing_them():
     mdp, seen, _ = stream()
-    report = run_sessions(rimeo(mdp, task().features, scores="none", truths="observed"), seen, key=KEY).infos[
-        -1
-    ]
+    report = run_sessions(
+        rimeo(mdp, task().features, scores="none", completion="observed"), seen, key=KEY
+    ).infos[-1]
     assert report.agreement.min() > 0.98
 
 
@@ -254,7 +263,7 @@ def test_coded_frequencies_credit_what_is_true_of_each_last_report():
 
 def test_the_printed_program_is_no_better_than_a_guess():
     mdp, seen, _ = stream()
-    learner = rimeo(mdp, task().predicates, truths="all")
+    learner = rimeo(mdp, task().predicates, completion="all")
     report = run_sessions(learner, seen, key=KEY).infos[-1]
     assert divergence(task(), report.agreement) > divergence(task(), np.full(8, 0.5)) / 6
 
@@ -319,7 +328,7 @@ def test_a_report_no_truth_could_give_is_named_and_costs_nothing():
 
 def test_truths_that_do_not_fit_the_reports_are_named():
     mdp, seen, truth = stream()
-    learner = rimeo(mdp, task().features, scores="none", truths="oracle")
+    learner = rimeo(mdp, task().features, scores="none", completion="oracle")
     state = learner.init(KEY)
     with pytest.raises(DemonstrationError, match=r"one shape, got \[1, 3\] and \[2, 3\]"):
         learner.update(state, WithTruth(seen[0], truth[0].select([0])))
@@ -335,15 +344,15 @@ def test_truths_that_do_not_fit_the_reports_are_named():
     ("options", "message"),
     [
         ({"start": np.full(3, 0.7)}, r"one for each of 8 predicates, got \[3\]"),
-        ({"view": Visibility(np.ones(1))}, "the MDP has 22 states"),
+        ({"visibility": Visibility(np.ones(1))}, "the MDP has 22 states"),
         ({"scores": "some"}, "scores must be one of"),
-        ({"truths": "guess"}, "truths must be one of"),
-        ({"errors": -1.0}, "errors must be"),
+        ({"completion": "guess"}, "truths must be one of"),
+        ({"observation_slack": -1.0}, "errors must be"),
         ({"forgetting": 0.0}, "forgetting must be an exponent"),
         ({"start": 1.0}, "between 0 and 1"),
         ({"iterations": 0}, "at least one iteration"),
-        ({"truths": "all", "scores": "none"}, "made of scores"),
-        ({"view": FeatureNoise(np.ones((1, 22, 7), bool), np.array([0.5]))}, "learned, not given"),
+        ({"completion": "all", "scores": "none"}, "made of scores"),
+        ({"visibility": FeatureNoise(np.ones((1, 22, 7), bool), np.array([0.5]))}, "learned, not given"),
     ],
 )
 def test_settings_out_of_range_are_named(options, message):

@@ -51,14 +51,14 @@ def test_the_posterior_is_that_of_quadrature(toy, demonstration):
         toy,
         PREDICATES,
         demonstration,
-        view=Visibility(VIEW),
+        visibility=Visibility(VIEW),
         names=("edge",),
         chains=2,
         draws=600,
         **priors,
     )
     assert drawn.posterior.predicate.values.tolist() == ["edge"]
-    problem, rows = noisy_problem(toy, PREDICATES, demonstration, view=Visibility(VIEW))
+    problem, rows = noisy_problem(toy, PREDICATES, demonstration, visibility=Visibility(VIEW))
     theta, p = (x.ravel() for x in np.meshgrid(np.linspace(-8, 12, 61), (np.arange(60) + 0.5) / 60))
     likelihood = noisy_log_likelihood(jnp.asarray(theta[:, None]), jnp.asarray(p[:, None]), problem)
     log_posterior = np.asarray(likelihood)[:, rows].sum(1)
@@ -84,14 +84,14 @@ def test_labels_take_the_place_of_predicates(toy, demonstration):
     potential = jax.jit(jax.value_and_grad(noisy_potential))
     position = jnp.array([1.2, 0.7])
     plain, named = (
-        potential(position, noisy_problem(toy, psi, demonstration, view=Visibility(VIEW))[0])
+        potential(position, noisy_problem(toy, psi, demonstration, visibility=Visibility(VIEW))[0])
         for psi in (PREDICATES, 7 - 4 * PREDICATES)
     )
     np.testing.assert_allclose(named[0], plain[0], rtol=1e-12)
     np.testing.assert_allclose(named[1], plain[1], rtol=1e-9)
     state = np.tile(np.arange(3)[:, None], 2)[None]
     drawn = sample_noisy_posterior(
-        jax.random.key(0), toy, state, demonstration, view=Visibility(VIEW), chains=1, draws=5, warmup=5
+        jax.random.key(0), toy, state, demonstration, visibility=Visibility(VIEW), chains=1, draws=5, warmup=5
     )
     assert np.isfinite(drawn.posterior.reliabilities).all()
 
@@ -99,7 +99,7 @@ def test_labels_take_the_place_of_predicates(toy, demonstration):
 def test_bad_input_is_refused_in_its_own_terms(toy, demonstration):
     def sample(demonstration=demonstration, predicates=PREDICATES, **options):
         sample_noisy_posterior(
-            jax.random.key(0), toy, predicates, demonstration, view=Visibility(VIEW), **options
+            jax.random.key(0), toy, predicates, demonstration, visibility=Visibility(VIEW), **options
         )
 
     with pytest.raises(ValueError, match="chains must be at least 1"):

@@ -27,7 +27,7 @@ def predicates():
     return np.array([[[1, 0], [1, 1], [0, 1]], [[0, 0], [1, 0], [0, 1]], [[1, 1], [0, 0], [1, 0]]], bool)
 
 
-def evidence_by_hand(codes, predicates, reliabilities, reportable, view):
+def evidence_by_hand(codes, predicates, reliabilities, reportable, visibility):
     """``log e_t(s, a)`` of one trajectory, one pair of pairs at a time (Eq. 6.5, normalised)."""
     _, n_states, n_actions = predicates.shape
     table = np.zeros((n_states, n_actions, n_states, n_actions))
@@ -45,9 +45,9 @@ def evidence_by_hand(codes, predicates, reliabilities, reportable, view):
         if kind == SEEN:
             reports = table[:, :, slice(None) if o == UNKNOWN else [o]]
             reports = reports[..., slice(None) if b == UNKNOWN else [b]]
-            evidence[t] = reports.sum((2, 3)) * view[:, None]
+            evidence[t] = reports.sum((2, 3)) * visibility[:, None]
         elif kind == HIDDEN:
-            evidence[t] = 1 - view[:, None]
+            evidence[t] = 1 - visibility[:, None]
     with np.errstate(divide="ignore"):
         return np.log(evidence)
 
@@ -61,21 +61,21 @@ def test_the_density_is_that_of_enumeration(
     rng = np.random.default_rng(int(hides))
     weights, p = rng.normal(size=2), rng.uniform(0.1, 0.95, 3)
     reportable = np.array([[1, 1], [1, 0], [1, 1]], bool)
-    view = VIEW if hides else np.ones(3)
+    visibility = VIEW if hides else np.ones(3)
     log_policy = soft_plan(toy, reward_of(toy, jnp.asarray(weights))).log_policy
-    sensor = FeatureNoise(predicates, p, reportable) * Visibility(view)
+    sensor = FeatureNoise(predicates, p, reportable) * Visibility(visibility)
     demonstration = imperfect_demonstration(4, toy, log_policy, sensor, 6, 4)
     expected = stats.norm.logpdf(weights, scale=2.5 / feature_scale(toy)).sum()
     expected += stats.beta.logpdf(p, 3, 1.5).sum()
     for codes, length in zip(np.asarray(demonstration.codes), demonstration.lengths, strict=True):
-        by_hand = evidence_by_hand(codes[:length], predicates, p, reportable, view)
+        by_hand = evidence_by_hand(codes[:length], predicates, p, reportable, visibility)
         expected += enumerate_completions(toy, log_policy, by_hand).log_likelihood
     assert np.isfinite(expected)
     density, _ = log_density(
         noisy_behaviour_model,
         (toy, jnp.asarray(predicates), jnp.asarray(demonstration.codes)),
         {
-            "view": Visibility(view) if hides else None,
+            "visibility": Visibility(visibility) if hides else None,
             "reportable": jnp.asarray(reportable),
             "reliability_prior": dist.Beta(3.0, 1.5),
         },
@@ -94,7 +94,7 @@ def test_the_gradient_is_that_of_differences(toy, predicates, imperfect_demonstr
     def density(x):
         sites = {"weights": x[:2], "reliabilities": x[2:]}
         arguments = (toy, jnp.asarray(predicates), codes)
-        return log_density(noisy_behaviour_model, arguments, {"view": Visibility(VIEW)}, sites)[0]
+        return log_density(noisy_behaviour_model, arguments, {"visibility": Visibility(VIEW)}, sites)[0]
 
     x = np.concatenate([[0.5, -0.2], p])
     steps = 1e-5 * np.eye(5)
@@ -111,7 +111,7 @@ def test_reliabilities_of_nearly_one_leave_the_law_of_exact_perception(toy, impe
     p = np.full(3, 1 - 1e-13)
     sites = {"weights": weights, "reliabilities": jnp.asarray(p)}
     density, _ = log_density(
-        noisy_behaviour_model, (toy, jnp.asarray(numbers), codes), {"view": Visibility(VIEW)}, sites
+        noisy_behaviour_model, (toy, jnp.asarray(numbers), codes), {"visibility": Visibility(VIEW)}, sites
     )
     exact = TrajectoryLaw(toy, weights, Visibility(VIEW), 4).log_prob(codes).sum()
     assert np.isfinite(exact)
@@ -143,4 +143,4 @@ def test_bad_input_is_refused_in_its_own_terms(toy, predicates):
     with pytest.raises(ValueError, match="observation model is about"):
         density(toy, jnp.asarray(predicates[:, :2]), codes)
     with pytest.raises(ValueError, match="one noise"):
-        density(toy, jnp.asarray(predicates), codes, view=FeatureNoise(predicates, np.full(3, 0.5)))
+        density(toy, jnp.asarray(predicates), codes, visibility=FeatureNoise(predicates, np.full(3, 0.5)))

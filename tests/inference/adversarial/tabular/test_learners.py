@@ -90,9 +90,9 @@ def watched(mdp, expert, sensor) -> tuple[Demonstration, Demonstration]:
 def learned(mdp: TabularMDP, noise: Confusions) -> Learner:
     """Learns reward, policy and sensor behind a view: every part there is."""
     assumed = Confusions(noise.reports, np.array([0.15, 0.15]))
-    view = Visibility(np.arange(mdp.n_states) != 1)
+    visibility = Visibility(np.arange(mdp.n_states) != 1)
     return robust_airl_with_learned_sensor(
-        mdp, assumed, view=view, iterations=40, learning_rate=1e-2, horizon=LENGTH
+        mdp, assumed, visibility=visibility, iterations=40, learning_rate=1e-2, horizon=LENGTH
     )
 
 
@@ -310,7 +310,7 @@ def test_what_cannot_be_combined_is_said(mdp, noise, sensor):
     with pytest.raises(ValueError, match="step must be finite"):
         gail_tabular(mdp, step=np.inf)
     with pytest.raises(ValueError, match="learned, not given"):
-        robust_airl_with_learned_sensor(mdp, noise, view=sensor)
+        robust_airl_with_learned_sensor(mdp, noise, visibility=sensor)
     with pytest.raises(ValueError, match="confusion 1 is 0"):
         robust_airl_with_learned_sensor(mdp, Confusions(noise.reports, np.array([0.1, 0.0])))
     with pytest.raises(ValueError, match="has 5 states"):
