@@ -69,6 +69,18 @@ def policy_map(
     See Also
     --------
     value_map, hidden_path
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.analysis import policy_map
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import Layout, reward_of, soft_plan
+    >>> corridor = five_cells()
+    >>> policy = soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights)).policy
+    >>> layout = Layout.grid([(0, column) for column in range(5)])
+    >>> policy_map(corridor.mdp, np.asarray(policy), layout).axes[0].get_xlabel()
+    'column (cells)'
     """
     require_layout(layout, mdp)
     policy = np.asarray(policy)
@@ -119,6 +131,18 @@ def value_map(
     See Also
     --------
     policy_map, hidden_path
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.analysis import value_map
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.models import Layout, reward_of, soft_plan
+    >>> corridor = five_cells()
+    >>> values = soft_plan(corridor.mdp, reward_of(corridor.mdp, corridor.weights)).values
+    >>> layout = Layout.grid([(0, column) for column in range(5)])
+    >>> value_map(corridor.mdp, np.asarray(values), layout).axes[0].get_xlabel()
+    'column (cells)'
     """
     require_layout(layout, mdp)
     values = np.asarray(values, float)
@@ -546,6 +570,16 @@ def hidden_path(
     See Also
     --------
     policy_map, value_map
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.analysis import hidden_path
+    >>> from i2rl.models import Layout
+    >>> belief = np.array([[1, 0, 0], [0.2, 0.8, 0], [0, 0, 1]])  # three steps, three cells
+    >>> layout = Layout.grid([(0, 0), (0, 1), (0, 2)])
+    >>> hidden_path(belief, np.array([True, False, True]), layout).axes[1].get_xlabel()
+    'step'
     """
     posterior, seen = np.asarray(posterior), np.asarray(seen, bool)
     length = len(seen)

@@ -402,6 +402,24 @@ def completed_path(
     ``path`` is the true states of their steps. See :func:`~i2rl.analysis.drawing.maps.hidden_path`.
 
     Raises ``ValueError`` for rows that do not exist and a layout of another number of states.
+
+    See Also
+    --------
+    i2rl.analysis.hidden_path : the picture of any belief
+
+    Examples
+    --------
+    >>> import jax
+    >>> from i2rl.analysis import completed_path
+    >>> from i2rl.domains import five_cells
+    >>> from i2rl.inference import sample_posterior
+    >>> from i2rl.models import Layout
+    >>> mdp, _, sensor, demonstration = five_cells()
+    >>> options = {"draws": 100, "warmup": 100, "chains": 2}
+    >>> posterior = sample_posterior(jax.random.key(0), mdp, sensor, demonstration, **options)
+    >>> layout = Layout.grid([(0, column) for column in range(5)])
+    >>> completed_path(mdp, posterior, [0], layout).axes[1].get_xlabel()
+    'step'
     """
     require_layout(layout, mdp)
     belief, seen = completion_frequencies(idata, trajectories, mdp)

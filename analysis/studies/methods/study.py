@@ -184,7 +184,7 @@ def methods_study(
     Examples
     --------
     >>> from i2rl.analysis import methods_study
-    >>> study = methods_study(2, sessions=4, runs=1, methods=["ME-I2RL, features"])
+    >>> study = methods_study(2, sessions=4, replications=1, methods=["ME-I2RL, features"])
     >>> [curve.name for curve in study.curves], study.points.tolist()
     (['ME-I2RL, features'], [5, 10, 15, 20])
     >>> study.curves[0].accuracy.shape

@@ -463,7 +463,7 @@ def noisy_study(
     Examples
     --------
     >>> from i2rl.analysis import noisy_study
-    >>> study = noisy_study("sorting", runs=1, sessions=2, belts=10, draws=0, methods=[])
+    >>> study = noisy_study("sorting", replications=1, sessions=2, belts=10, draws=0, methods=[])
     >>> list(study.results), study.true_agreement.shape
     (['RIMEO, no scores'], (8,))
     """

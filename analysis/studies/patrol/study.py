@@ -177,7 +177,7 @@ def patrol_study(
     Examples
     --------
     >>> from i2rl.analysis import patrol_study
-    >>> study = patrol_study(2, sessions=2, trials=5, runs=1, methods=["random"])
+    >>> study = patrol_study(2, sessions=2, trials=5, replications=1, methods=["random"])
     >>> [result.name for result in study.methods]
     ['random weights', 'true policy']
     >>> study.methods[-1].breach.ended.shape

@@ -221,7 +221,7 @@ def sorting_study(
     Examples
     --------
     >>> from i2rl.analysis import sorting_study
-    >>> study = sorting_study(2, [4], runs=1, methods=["em-mlirl"], steps=10, belts=10)
+    >>> study = sorting_study(2, [4], replications=1, methods=["em-mlirl"], steps=10, belts=10)
     >>> [(result.name, result.trajectories.tolist()) for result in study.results]
     [('EM-MLIRL', [4])]
     """
