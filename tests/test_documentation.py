@@ -19,7 +19,17 @@ WITH_CODE = [page for page in PAGES if "```python" in page.read_text()]
 
 
 def blocks(page: Path, language: str) -> list[str]:
-    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    """Code blocks of a page in a language, none for blocks without one."""
+    found: list[str] = []
+    inside: str | None = None
+    for line in page.read_text().splitlines():
+        if line.startswith("```"):
+            inside = line[3:].strip() if inside is None else None
+            if inside == language:
+                found.append("")
+        elif inside == language:
+            found[-1] += line + "\n"
+    return found
 
 
 @pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.relative_to(ROOT).as_posix())

@@ -17,6 +17,7 @@ from typer.core import TyperGroup
 from ...compilation import keep_programs
 from . import run, simulate
 from .bounds import print_bounds
+from .console import show_progress
 from .learn import learn_online
 from .show import show_journal
 
@@ -69,7 +70,7 @@ def _options(
         bool, typer.Option("--quiet", "-q", help="Print no progress on standard error.")
     ] = False,
 ) -> None:
-    pass
+    show_progress(not quiet)
 
 
 def _interrupt_again(unraisable: Any) -> None:

@@ -11,7 +11,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import click
 import typer
 
 if TYPE_CHECKING:
@@ -21,6 +20,7 @@ if TYPE_CHECKING:
 LONGEST_MESSAGE = 1000
 _FIRST_STEP = "starting: the first step is compiled, unless the cache has its program"
 _SECONDS_A_LINE = 2.0
+_quiet = False
 
 
 def print_results(teller: Any, study: Any, folder: Path, as_json: bool) -> None:
@@ -59,9 +59,10 @@ def reported_errors() -> Iterator[None]:
         raise typer.Exit(1) from None
 
 
-def _is_quiet() -> bool:
-    context = click.get_current_context(silent=True)
-    return context is not None and bool(context.find_root().params.get("quiet"))
+def show_progress(shown: bool) -> None:
+    """Show the progress of the command that follows, or none."""
+    global _quiet
+    _quiet = not shown
 
 
 @contextmanager
@@ -70,7 +71,7 @@ def progress(quiet: bool) -> Iterator[Any]:
 
     A terminal shows a bar. A file or a pipe gets a line a step, at most one every two seconds.
     """
-    if quiet or _is_quiet():
+    if quiet or _quiet:
         yield lambda description, fraction: None
         return
     if not sys.stderr.isatty():
