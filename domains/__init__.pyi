@@ -68,6 +68,8 @@ from .patrol.process import (
     simulate_patrol as simulate_patrol,
 )
 from .patrol.trials import (
+    Planning as Planning,
+    Watching as Watching,
     breach_trials as breach_trials,
 )
 from .robots.control import (

@@ -244,8 +244,8 @@ def perception_needed(
     --------
     >>> from i2rl.analysis import perception_needed
     >>> table = perception_needed(n_features=2, predicates=3, longest=4, error=0.3, confidence=0.9)
-    >>> table[["trajectories", "reports"]].to_dict("index")
-    {'printed': {'trajectories': 240, 'reports': 42380}, 'corrected': {'trajectories': 98, 'reports': 13229}}
+    >>> table.trajectories.to_dict(), table.observations.to_dict()
+    ({'printed': 240, 'corrected': 98}, {'printed': 42380, 'corrected': 13229})
     """
     counted("predicates", predicates), counted("longest", longest)
     if not 0 < error <= 1:

@@ -218,11 +218,11 @@ def breach_trials(
     Examples
     --------
     >>> import jax
-    >>> from i2rl.domains import breach_trials, instance
+    >>> from i2rl.domains import Watching, breach_trials, instance
     >>> patrol = instance(2)
     >>> known = jax.numpy.log(jax.numpy.stack([patrol.expert_policy()] * 2))
-    >>> options = dict(observability=30, observed_steps=10, trials=5)
-    >>> outcome = breach_trials(jax.random.key(0), patrol, known, **options)
+    >>> watching = Watching(observability=30, observed_steps=10)
+    >>> outcome = breach_trials(jax.random.key(0), patrol, known, watching=watching, trials=5)
     >>> outcome.threshold, outcome.rate() > 0.5
     (244.0, True)
     """
