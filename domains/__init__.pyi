@@ -69,7 +69,11 @@ from .patrol.process import (
 )
 from .patrol.trials import (
     Planning as Planning,
+)
+from .patrol.trials import (
     Watching as Watching,
+)
+from .patrol.trials import (
     breach_trials as breach_trials,
 )
 from .robots.control import (

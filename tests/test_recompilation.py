@@ -8,11 +8,7 @@ from jax import monitoring
 from i2rl.inference import batch_mme_mtirl, sample_posterior
 from i2rl.models import (
     Visibility,
-    feature_deviations,
     feature_expectations,
-    features_to_go,
-    finite_hard_plan,
-    finite_occupancy,
     finite_soft_plan,
     hard_plan,
     occupancy,
@@ -20,6 +16,12 @@ from i2rl.models import (
     reward_of,
     simulate,
     soft_plan,
+)
+from i2rl.models.process.planning import (
+    feature_deviations,
+    features_to_go,
+    finite_hard_plan,
+    finite_occupancy,
 )
 
 EVENTS = []

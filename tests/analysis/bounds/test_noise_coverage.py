@@ -55,11 +55,11 @@ def test_another_sensor_is_refused(setting):
 def test_completion_uses_the_reliabilities_of_its_run(setting):
     mdp, expert, noise = setting.mdp, expert_of(setting.mdp, setting.weights), setting.sensor
     # Shapes are those of the study below, which is then compiled once.
-    codes = simulate_codes(jax.random.key(1), mdp, expert, noise.reading, 4, 30, 50)
+    codes = simulate_codes(jax.random.key(1), mdp, expert, noise.noise, 4, 30, 50)
     p = jnp.asarray(np.random.default_rng(0).uniform(0.6, 0.9, (30, 3)))
     found = complete_under(jax.random.key(2), mdp, expert, noise, p, codes, 2).exact
     for run in range(2):
-        reading = FeatureNoise(noise.predicates, p[run], noise.reportable).reading
+        reading = FeatureNoise(noise.predicates, p[run], noise.reportable).noise
         alone = complete_features(jax.random.key(3), mdp, expert, reading, codes[run : run + 1], 2).exact
         np.testing.assert_allclose(found[run], alone[0], atol=1e-12)
 
@@ -97,7 +97,7 @@ def test_reports_that_say_nothing_teach_nothing_under_the_learners_own_weights()
     # For every observation the posterior under zero weights has the features of zero weights.
     mdp, expert = setting.mdp, expert_of(setting.mdp, setting.weights)
     nobody = expert_of(mdp, jnp.zeros(2))
-    codes = simulate_codes(jax.random.key(6), mdp, expert, setting.sensor.reading, 4, 30, 50)
+    codes = simulate_codes(jax.random.key(6), mdp, expert, setting.sensor.noise, 4, 30, 50)
     p = jnp.broadcast_to(setting.sensor.reliabilities, (30, 3))
     completed = complete_under(jax.random.key(7), mdp, nobody, setting.sensor, p, codes, 2).exact
     np.testing.assert_allclose(completed, np.broadcast_to(nobody.features, completed.shape))

@@ -20,11 +20,11 @@ from i2rl.analysis.bounds.perception import (
 from i2rl.analysis.bounds.theorems import failure_probability, lme_constraint_bound, no_regret
 from i2rl.analysis.command.app import app
 
-PERCEPTION = Perception(draws=50_000, epsilon_o=0.01, predicates=4, longest=5)
+PERCEPTION = Perception(observations=50_000, epsilon_o=0.01, predicates=4, longest=5)
 
 
 def test_perfect_perception_makes_rimeos_bound_lmes():
-    perception = Perception(draws=10**9, epsilon_o=1e-4, predicates=8, longest=3)
+    perception = Perception(observations=10**9, epsilon_o=1e-4, predicates=8, longest=3)
     rimeo = rimeo_constraint_bound(300, 1000, 0.1, 0.05, perception, 6)
     lme = lme_constraint_bound(300, 1000, 0.1, 0.05, 6)
     assert rimeo.confidence == pytest.approx(lme.confidence)

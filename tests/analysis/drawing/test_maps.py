@@ -10,9 +10,10 @@ from matplotlib.collections import PathCollection, PolyCollection, QuadMesh
 from matplotlib.figure import Figure
 
 from i2rl.analysis.drawing import maps, style
-from i2rl.domains.labyrinth.process import labyrinth
-from i2rl.domains.object_world.process import object_world
-from i2rl.models import Layout, Mark, TabularMDP
+from i2rl.domains.labyrinth.process import mouse_labyrinth
+from i2rl.domains.object_world.process import random_object_world
+from i2rl.models import Layout, TabularMDP
+from i2rl.models.process.layout import Mark
 
 N = 4
 CELLS = [(r, c) for r in range(N) for c in range(N)]
@@ -126,19 +127,19 @@ def test_parts_of_a_graph_that_nothing_joins_do_not_lie_on_each_other() -> None:
 
 @pytest.mark.parametrize("theme", style.THEMES, ids=lambda theme: theme.name)
 def test_domains_bring_their_layout(theme: style.Theme) -> None:
-    for process in (object_world(jax.random.key(0)), labyrinth()):
+    for process in (random_object_world(jax.random.key(0)), mouse_labyrinth()):
         mdp, layout = process.mdp, process.layout
         figure = drawn(maps.policy_map(mdp, np.ones((mdp.n_states, mdp.n_actions)), layout, theme=theme))
         told = {text.get_text() for text in figure.axes[-1].texts}
         assert {mark.meaning for mark in layout.marks} <= told
-    maze = labyrinth()
+    maze = mouse_labyrinth()
     assert maze.layout.n_places == 128
     np.testing.assert_array_equal(maze.layout.place[maze.node == 5], maze.layout.place[maze.node == 5][0])
 
 
 @pytest.mark.parametrize("kind", ["open grid", "ring", "maze"])
 def test_a_hidden_path_over_any_layout_shows_the_belief(kind: str) -> None:
-    layout = {"open grid": Layout.grid(CELLS), "ring": ring()[1], "maze": labyrinth().layout}[kind]
+    layout = {"open grid": Layout.grid(CELLS), "ring": ring()[1], "maze": mouse_labyrinth().layout}[kind]
     rng = np.random.default_rng(0)
     belief = np.zeros((8, layout.n_states))
     belief[np.arange(8), path := rng.integers(0, layout.n_states, 8)] = 1.0

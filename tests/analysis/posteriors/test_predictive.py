@@ -71,7 +71,7 @@ def predicted(sure, mdp, sensor, demonstration):
 def mean_visits(mdp, moves, sensor, demonstration):
     """Step by step with the dense chain: where the expert is, whether it is seen there, what is read."""
     policy = np.asarray(soft_plan(mdp, reward_of(mdp, jnp.asarray(WEIGHTS))).policy)
-    reading = np.exp(np.asarray(sensor.reading.log_probabilities)).sum(-1)
+    reading = np.exp(np.asarray(sensor.noise.log_probabilities)).sum(-1)
     chain = np.einsum("sa,sat->st", policy, moves)
     expected = np.zeros(mdp.n_states)
     for kinds, states in zip(demonstration.kind, demonstration.state, strict=True):

@@ -194,7 +194,7 @@ def test_unscored_evidence_is_that_of_noise_on_features(mask):
     classes = report_classes(FEATURES, mask)
     reports = session_reports(classes, demonstration(ROWS), scored=False)
     found = report_log_evidence(classes, jnp.asarray(LOGITS), reports, jnp.full((1, 1), jnp.nan))
-    reading = FeatureNoise(FEATURES, 1 / (1 + np.exp(-LOGITS)), mask).reading
+    reading = FeatureNoise(FEATURES, 1 / (1 + np.exp(-LOGITS)), mask).noise
     for i, t in ((0, 0), (0, 2), (1, 2), (2, 0)):
         _, state, action, score = ROWS[i][t]
         expected = reading.log_likelihood(jnp.array(state), jnp.array(action), jnp.array(score))

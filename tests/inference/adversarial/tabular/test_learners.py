@@ -246,7 +246,7 @@ def test_how_often_reports_err_is_learned(noise, watched, sensor_learned):
 
 def test_a_session_with_sampled_truths_gives_the_state_that_the_next_one_takes(mdp, noise, watched):
     # Traced, not run: the sampler itself is tested with the transitions.
-    learner = gibbs_airl_tabular(mdp, Sensor(None, noise.reading), draws=3, burn_in=1, horizon=LENGTH)
+    learner = gibbs_airl_tabular(mdp, Sensor(None, noise.noise), draws=3, burn_in=1, horizon=LENGTH)
     state = learner.init(jax.random.key(0))
     after, report = jax.eval_shape(learner.session, state, watched[1].select(slice(0, 4)))
     same = jax.tree.map(lambda x, y: (x.shape, x.dtype) == (y.shape, y.dtype), state, after)
