@@ -78,6 +78,7 @@ IN_ITS_OWN_SENSE = {
     ("sweeps", "analysis/bounds/stopping.py:stopping_plot"): "sweeps over a parameter",
     ("sweeps", "analysis/studies/methods/study.py:MethodsStudy"): "sweeps over a parameter",
     ("sweeps", "inference/completion/gibbs.py:GibbsChain"): "sweeps of a Gibbs sampler",
+    ("sweeps", "inference/posteriors/gibbs.py:gibbs_chain"): "sweeps of a Gibbs sampler",
     ("sweeps", "inference/completion/gibbs.py:GaussianGibbs"): "sweeps of a Gibbs sampler",
 }
 

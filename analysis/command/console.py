@@ -59,10 +59,10 @@ def reported_errors() -> Iterator[None]:
         raise typer.Exit(1) from None
 
 
-def show_progress(shown: bool) -> None:
+def show_progress(visible: bool) -> None:
     """Show the progress of the command that follows, or none."""
     global _quiet
-    _quiet = not shown
+    _quiet = not visible
 
 
 @contextmanager

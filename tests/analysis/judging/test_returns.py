@@ -346,7 +346,7 @@ def test_where_noise_may_have_cost_nothing_the_interval_has_no_end():
     assert found.high == math.inf
     with pytest.raises(ValueError, match="one number a replication"):
         recovered_share(clean, noisy[:9], robust, KEY)
-    with pytest.raises(ValueError, match="seed 1 of robust is not finite"):
+    with pytest.raises(ValueError, match="replication 1 of robust is not finite"):
         recovered_share([1.0, 1.0], [0.0, 0.0], [0.5, np.nan], KEY)
 
 

@@ -346,7 +346,7 @@ def test_truths_that_do_not_fit_the_reports_are_named():
         ({"start": np.full(3, 0.7)}, r"one for each of 8 predicates, got \[3\]"),
         ({"visibility": Visibility(np.ones(1))}, "the MDP has 22 states"),
         ({"scores": "some"}, "scores must be one of"),
-        ({"completion": "guess"}, "truths must be one of"),
+        ({"completion": "guess"}, "completion must be one of"),
         ({"observation_slack": -1.0}, "errors must be"),
         ({"forgetting": 0.0}, "forgetting must be an exponent"),
         ({"start": 1.0}, "between 0 and 1"),
