@@ -250,7 +250,7 @@ def sorting_study(
             fits = _batch_fits(sorting.mdp, method, tasks, n_components, sizes)
             with warnings.catch_warnings():
                 # The results state once that fewer trajectories than components give fewer components.
-                warnings.filterwarnings("ignore", "[0-9]+ ways were to be started from")
+                warnings.filterwarnings("ignore", ".* is [0-9]+, but there are [0-9]+ trajectories")
                 measured = _batch(sorting, tasks, METHODS[method], fits, streams, tell)
         results.append(measured)
     advance("sorting belts", None)
