@@ -161,7 +161,8 @@ def moments(idata: az.InferenceData) -> dict[str, Float[np.ndarray, "chain draw"
         f"trajectories {i} and {j} together": components[..., i] == components[..., j]
         for i, j in itertools.combinations(range(components.shape[-1]), 2)
     }
-    found |= {f"{k} components": invariant.n_components.values == k for k in range(1, components.shape[-1] + 1)}
+    counts = range(1, components.shape[-1] + 1)
+    found |= {f"{k} components": invariant.n_components.values == k for k in counts}
     found |= {
         "number of components": invariant.n_components.values,
         "concentration": invariant.concentration.values,
