@@ -224,7 +224,7 @@ def fuzz_lines(seed: int, n: int) -> dict[str, Tally]:
             file = io.StringIO()
             write_trajectories(file, record.demonstration, mdp, ids=[record.id or ""])
             (again,) = read_trajectories([file.getvalue()], mdp)
-            for one, two in zip(record.demonstration, again.demonstration, strict=True):
+            for one, two in zip(record.demonstration.arrays, again.demonstration.arrays, strict=True):
                 if not np.array_equal(one, two, equal_nan=True):
                     raise AssertionError("what was read is not read back")
 

@@ -140,5 +140,5 @@ def test_distortion_leaves_padding_alone():
 
 def test_normal_noise_is_not_added_to_numbers_of_actions():
     numbered = recording([np.zeros((5, 2))], [np.zeros(5, int)])
-    with pytest.raises(ValueError, match=r"vectors of actions.*got \(1, 5\) beside"):
+    with pytest.raises(ValueError, match=r"action vectors .*got shape \(1, 5\) beside"):
         distort(jax.random.key(0), GaussianSensor(0.1, 0.1), numbered)
