@@ -114,7 +114,7 @@ def test_errors_and_sizes_out_of_range_are_refused():
         perception_needed(6, 8, 3, 0.2, 1.0)
     with pytest.raises(ValueError, match="predicates must be at least 1, got 0"):
         perception_needed(6, 0, 3, 0.2, 0.8)
-    with pytest.raises(ValueError, match="2 session sizes, but 2 numbers of samples and 1 of observations"):
+    with pytest.raises(ValueError, match="2 session sizes, but 2 numbers of draws and 1 of observations"):
         rimeo_no_regret(5.0, [1, 1], [1, 1], [1], 2, 3, 4, 0.9)
     with pytest.raises(ValueError, match="longest must be at least 1, got 0"):
         noisy_constraint_bound(10, 0.1, PERCEPTION._replace(longest=0), 6)
