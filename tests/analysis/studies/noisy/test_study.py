@@ -73,7 +73,7 @@ def test_streams_are_the_demonstration_cut_into_runs_and_sessions():
     streams = draw_streams(key, task(), replications=replications, sessions=sessions)
     drawn = demonstrate_noisy(key, task(), sessions=replications * sessions, scores="calibrated")
     for i, session in enumerate(drawn.seen.sessions(2)):
-        for ours, theirs in zip(streams.session(*divmod(i, sessions)), session, strict=True):
+        for ours, theirs in zip(streams.session(*divmod(i, sessions)).arrays, session.arrays, strict=True):
             np.testing.assert_array_equal(ours, theirs)
     whole = streams.whole(1, "truth")
     np.testing.assert_array_equal(whole.state, np.asarray(drawn.truth.state)[4:8])
