@@ -9,8 +9,9 @@ from jaxtyping import Float
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from ...models.inputs.text import counted
 from ..drawing.style import LIGHT, SMALL, Theme, dress, foot, head, name_ticks, new_figure, series_style
-from ..drawing.text import counted, number
+from ..drawing.text import number
 from .coverage import Coverage
 from .theorems import demonstrations_needed, table_7_1a
 

@@ -38,11 +38,11 @@ from ...inference.sessions.fleets import run_streams
 from ...inference.sessions.learner import Learner, SessionInfo
 from ...inference.sessions.running import average_regret
 from ...inference.sessions.statistic import STATISTICS
+from ...models.inputs.text import counted
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import reward_of, soft_plan
 from ..drawing.style import LIGHT, TEXT, Theme, dress, foot, head, method_styles, new_figure
-from ..drawing.text import counted
 from ..judging.metrics import quantile_band
 
 # -- what the expert does -----------------------------------------------------------------------------

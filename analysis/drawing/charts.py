@@ -18,9 +18,10 @@ from matplotlib.lines import Line2D
 from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator, NullFormatter, PercentFormatter
 from scipy.stats import binomtest
 
+from ...models.inputs.text import counted
 from ..judging.metrics import quantile_band
 from .style import LIGHT, TEXT, Theme, dress, foot, head, method_styles, name_ticks, new_figure
-from .text import counted, for_figure
+from .text import for_figure
 
 
 class LearningCurve(NamedTuple):

@@ -21,12 +21,13 @@ from matplotlib.patches import Patch, Rectangle
 from matplotlib.path import Path
 from matplotlib.ticker import MaxNLocator
 
+from ...models.inputs.text import counted
 from ...models.process.layout import Layout, require_layout
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import greedy_actions
 from ..judging.metrics import optimal_actions
 from .style import LIGHT, SMALL, TEXT, Theme, dress, dress_bar, headline, name_ticks, new_figure
-from .text import counted, for_figure
+from .text import for_figure
 
 _INCHES_PER_CELL, _SPAN = 0.46, 5.2
 FORWARD, LEFT, RIGHT, STAY, TOWARD = range(5)

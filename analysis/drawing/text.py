@@ -107,21 +107,6 @@ def _without_zeros(decimal: str) -> str:
     return decimal.rstrip("0").rstrip(".") if "." in decimal else decimal
 
 
-def counted(n: int, noun: str, plural: str | None = None) -> str:
-    """Write a count and its noun, in the plural unless the count is one.
-
-    >>> counted(1, "independent seed"), counted(1200, "trajectory"), counted(2, "breach")
-    ('1 independent seed', '1,200 trajectories', '2 breaches')
-    """
-    return f"{n:,} {noun if n == 1 else plural or _plural(noun)}"
-
-
-def _plural(noun: str) -> str:
-    if re.search("[^aeiou]y$", noun):
-        return f"{noun[:-1]}ies"
-    return f"{noun}es" if re.search("(s|x|ch|sh)$", noun) else f"{noun}s"
-
-
 def listed(names: list[str] | tuple[str, ...], conjunction: str = "and") -> str:
     """Join names as a sentence does.
 

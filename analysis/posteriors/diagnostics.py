@@ -7,7 +7,6 @@ dimensions ``chain``, ``draw`` and ``feature``; from :func:`posterior_by_session
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import partial
 from importlib.metadata import version
 from typing import Any, Unpack
 
@@ -20,15 +19,16 @@ import pandas as pd
 import xarray as xr
 from jaxtyping import Array
 
-from ...inference.posteriors.chains import Sampling, SamplingOptions, in_threads
+from ...inference.posteriors.chains import Sampling, SamplingOptions
 from ...inference.posteriors.weights import (
     Chain,
     Problem,
+    chain_jobs,
     described_prior,
     fingerprint,
     gather,
     posterior_mode,
-    run_nuts_chain,
+    run_chains,
 )
 from ...models.inputs.arguments import as_key
 from ...models.observation.demonstration import PAD, UNKNOWN, Demonstration
@@ -222,7 +222,7 @@ def posterior_by_session(
     >>> dict(narrowing["posterior"]["weights"].sizes)
     {'chain': 2, 'draw': 100, 'session': 3, 'feature': 2}
     """
-    draws, warmup, chains, target_accept, max_tree_depth = Sampling(**sampling).checked()
+    draws, warmup, chains, target_accept, max_tree_depth = settings = Sampling(**sampling).checked()
     if trajectories < 1:
         raise ValueError(f"trajectories must be at least 1, got {trajectories}")
     key, demonstration = as_key(key), checked_demonstration(mdp, demonstration)
@@ -233,21 +233,15 @@ def posterior_by_session(
     require_discounted(mdp)
     problem, rows = gather(mdp, sensor, demonstration, prior)
     require_possible(sensor, mdp, demonstration)
-    run = partial(
-        run_nuts_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
-    )
-    jobs = []
+    jobs: list[tuple] = []
     for number in numbers:
         part = _restricted(problem, rows[: number * trajectories])
         mode = posterior_mode(part)
         start_key, chain_key = jax.random.split(jax.random.fold_in(key, number))
-        # Dispersed twice as widely as the curvature suggests, as R-hat asks of starting points.
-        away = np.asarray(jax.random.normal(start_key, (chains, len(mode.position))))
-        starts = mode.position + 2.0 * away @ np.linalg.cholesky(mode.covariance).T
-        keys = jax.random.split(chain_key, chains)
-        jobs += [(k, part, x, mode.covariance) for k, x in zip(keys, starts, strict=True)]
+        jobs += chain_jobs(start_key, chain_key, part, mode, settings)
     stacked: Chain = jax.tree.map(
-        lambda x: np.moveaxis(x.reshape(len(numbers), chains, *x.shape[1:]), 0, 2), in_threads(run, jobs)
+        lambda x: np.moveaxis(x.reshape(len(numbers), chains, *x.shape[1:]), 0, 2),
+        run_chains(jobs, settings),
     )
     configuration = {
         "draws": draws,

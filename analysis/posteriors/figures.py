@@ -22,12 +22,13 @@ from matplotlib.patches import Patch
 from matplotlib.ticker import MaxNLocator
 from scipy import stats
 
+from ...models.inputs.text import counted
 from ...models.observation.demonstration import PAD, SEEN
 from ...models.process.layout import Layout, require_layout
 from ...models.process.mdp import TabularMDP
 from ..drawing.maps import hidden_path
 from ..drawing.style import LIGHT, SMALL, TEXT, Theme, dress, foot, head, name_ticks, new_figure, series_style
-from ..drawing.text import counted, for_figure, number
+from ..drawing.text import for_figure, number
 from .diagnostics import InferenceDataError, require_posterior, summary
 from .predictive import predictive_check
 

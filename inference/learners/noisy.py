@@ -130,6 +130,7 @@ class RIMEOInfo(NamedTuple):
     agreement: Float[np.ndarray, " J"]
 
 
+@shown_briefly
 class RIFOMSettings(NamedTuple):
     """Settings of the predicates and of the alternation, see :func:`rimeo`."""
 
@@ -150,6 +151,7 @@ class RIFOMOptions(TypedDict, total=False):
     tolerance: float
 
 
+@shown_briefly
 class RIMEOSettings(NamedTuple):
     """Settings of the predicates, of the comparison of observations, and of the alternation."""
 

@@ -8,7 +8,7 @@ draw of the weights one joint completion of the demonstration. Together they are
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any, NamedTuple, Unpack
 
@@ -39,7 +39,7 @@ from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted, reward_of, soft_plan
 from ...version import __version__
 from ..completion.smoothing import Evidence, evidence_of, log_likelihoods
-from ..sessions.progress import told
+from ..sessions.progress import progress_line
 from .chains import Mode, Sampling, SamplingOptions, Transitions, in_threads, mode_of, room_for, run_nuts
 
 
@@ -107,9 +107,6 @@ def _kernel(
     )
 
 
-run_nuts_chain = jax.jit(nuts_chain, static_argnames=("warmup", "draws", "target_accept", "max_tree_depth"))
-
-
 class _Lengths(NamedTuple):
     """Numbers for which a chain is compiled."""
 
@@ -119,7 +116,7 @@ class _Lengths(NamedTuple):
 
 
 @partial(jax.jit, static_argnames="lengths")
-def _run_roomy_chain(
+def run_padded_chain(
     key: Array,
     problem: Problem,
     start: Float[Array, " D"],
@@ -129,7 +126,7 @@ def _run_roomy_chain(
     *,
     lengths: _Lengths,
 ) -> Chain:
-    """:func:`nuts_chain` with room for ``lengths.room`` draws, of which the first ``draws`` are made."""
+    """Run :func:`nuts_chain` with room for ``lengths.room`` draws, of which the first ``draws`` are made."""
     warmup, room, max_tree_depth = lengths
     kernel = _kernel(problem, inverse_mass, target_accept, max_tree_depth)
     constrain = dist.biject_to(problem.prior.support)
@@ -338,7 +335,7 @@ def sample_posterior(
     require_discounted(mdp)
     problem, rows = gather(mdp, sensor, demonstration, prior)
     require_possible(sensor, mdp, demonstration)
-    with told(progress) as tell:
+    with progress_line(progress) as tell:
         idata = _sampled(key, problem, rows, demonstration, settings, completions, tell)
     for attrs in (idata.attrs, idata["posterior"].attrs):
         attrs["key"] = str(np.asarray(jax.random.key_data(key)).tolist())
@@ -354,24 +351,12 @@ def _sampled(
     completions: bool,
     tell: Callable[[str], None],
 ) -> az.InferenceData:
-    draws, warmup, chains, target_accept, max_tree_depth = sampling
+    draws, warmup, chains, _, max_tree_depth = sampling
     tell("posterior: finding the mode, compiling first")
     mode = posterior_mode(problem)
     tell(f"posterior: {chains} chains of {warmup} + {draws} draws, compiling first")
     start_key, chain_key, completion_key = jax.random.split(key, 3)
-    spread = 2.0 * np.linalg.cholesky(mode.covariance)
-    starts = mode.position + np.asarray(jax.random.normal(start_key, (chains, len(mode.position)))) @ spread.T
-    lengths = _Lengths(warmup, _room_for_draws(draws), max_tree_depth)
-    run = partial(_run_roomy_chain, lengths=lengths)
-    keys = jax.random.split(chain_key, chains)
-    chain: Chain = in_threads(
-        run,
-        [
-            (k, problem, x, mode.covariance, draws, float(target_accept))
-            for k, x in zip(keys, starts, strict=True)
-        ],
-    )
-    chain = jax.tree.map(lambda x: x[:, :draws], chain)
+    chain = run_chains(chain_jobs(start_key, chain_key, problem, mode, sampling), sampling)
     tell("posterior: log-likelihoods of the draws")
     flat = np.asarray(chain.weights).reshape(chains * draws, -1)
     shape = (chains, draws, demonstration.n_trajectories)
@@ -387,6 +372,29 @@ def _sampled(
         completed = Completions(*(x[:, : len(rows)].reshape(*shape, -1) for x in drawn))
     log_likelihood = log_likelihood.reshape(shape)
     return _inference_data(problem, demonstration, chain, log_likelihood, completed, max_tree_depth)
+
+
+def chain_jobs(
+    start_key: Array, chain_key: Array, problem: Problem, mode: Mode, sampling: Sampling
+) -> list[tuple]:
+    """Return the arguments of each chain of a problem.
+
+    Chains start twice as widely dispersed as the curvature at the mode suggests, as R-hat asks.
+    """
+    away = np.asarray(jax.random.normal(start_key, (sampling.chains, len(mode.position))))
+    starts = mode.position + 2.0 * away @ np.linalg.cholesky(mode.covariance).T
+    keys = jax.random.split(chain_key, sampling.chains)
+    return [
+        (k, problem, x, mode.covariance, sampling.draws, float(sampling.target_accept))
+        for k, x in zip(keys, starts, strict=True)
+    ]
+
+
+def run_chains(jobs: Sequence[tuple], sampling: Sampling) -> Chain:
+    """Run chains of :func:`chain_jobs` in threads, compiled once for draws within the same room."""
+    lengths = _Lengths(sampling.warmup, _room_for_draws(sampling.draws), sampling.max_tree_depth)
+    chains: Chain = in_threads(partial(run_padded_chain, lengths=lengths), jobs)
+    return jax.tree.map(lambda x: x[:, : sampling.draws], chains)
 
 
 def _inference_data(

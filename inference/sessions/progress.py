@@ -8,8 +8,8 @@ from contextlib import contextmanager
 
 
 @contextmanager
-def told(progress: bool) -> Iterator[Callable[[str], None]]:
-    """Give a function that takes the step that begins now; without ``progress`` it does nothing."""
+def progress_line(progress: bool) -> Iterator[Callable[[str], None]]:
+    """Yield a function that prints the step that begins; without ``progress`` it does nothing."""
     if not progress:
         yield lambda step: None
     elif sys.stderr.isatty():

@@ -9,11 +9,11 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from jaxtyping import Array, Float
 
-from ...models.inputs.display import brief, brief_table, counted, joined
-from ...models.inputs.text import shortened
+from ...models.inputs.display import brief, brief_table, joined
+from ...models.inputs.text import counted, shortened
 from ...models.observation.demonstration import Demonstration
 from .learner import Learner, SessionInfo
-from .progress import told
+from .progress import progress_line
 from .serialization import demonstration_digest
 from .stopping import StoppingCriterion
 
@@ -153,7 +153,7 @@ def run_sessions(
         state = learner.init(key)
     infos: list[SessionInfo] = []
     unlearned = ((one, b"") for one in stream) if journal is None else _unlearned(stream, journal, whole)
-    with told(progress) as tell:
+    with progress_line(progress) as tell:
         for demonstration, digest in unlearned:
             compiling = "" if infos else ", compiling first"
             tell(f"{learner.name}: session {int(state.session) + 1}{compiling}")

@@ -16,7 +16,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Int
 
-from .text import shortened
+from .text import counted, shortened
 
 LONGEST = 200
 _FEW = 8
@@ -132,24 +132,15 @@ def _array(value: Any) -> str:
     return brief(array[()]) if array.ndim == 0 else f"[{', '.join(_short_number(x) for x in array)}]"
 
 
-def told_steps(lengths: Int[np.ndarray, " n"]) -> str:
+def step_range(lengths: Int[np.ndarray, " n"]) -> str:
     """Write how many steps trajectories have, those without any left out.
 
-    >>> told_steps(np.array([5, 12, 0])), told_steps(np.array([7])), told_steps(np.array([1]))
+    >>> step_range(np.array([5, 12, 0])), step_range(np.array([7])), step_range(np.array([1]))
     ('5 to 12 steps', '7 steps', '1 step')
     """
     lengths = lengths[lengths > 0]
     low, high = (int(lengths.min()), int(lengths.max())) if len(lengths) else (0, 0)
     return counted(low, "step") if low == high else f"{low} to {high} steps"
-
-
-def counted(n: int, noun: str, plural: str = "") -> str:
-    """Write a number of things.
-
-    >>> counted(1, "state"), counted(2, "trajectory", "trajectories")
-    ('1 state', '2 trajectories')
-    """
-    return f"{n} {noun if n == 1 else plural or f'{noun}s'}"
 
 
 def _short_number(x: Any) -> str:

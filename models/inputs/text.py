@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import reprlib
 import sys
 from collections import Counter
@@ -42,6 +43,21 @@ def listed(names: Any, most: int = 4, limit: int = 40) -> str:
     """
     first = [shortened(name, limit) for _, name in zip(range(most), names, strict=False)]
     return ", ".join([*first, "..."] if len(names) > most else first)
+
+
+def counted(n: int, noun: str, plural: str | None = None) -> str:
+    """Write a count and its noun, in the plural unless the count is one.
+
+    >>> counted(1, "independent seed"), counted(1200, "trajectory"), counted(2, "breach")
+    ('1 independent seed', '1,200 trajectories', '2 breaches')
+    """
+    return f"{n:,} {noun if n == 1 else plural or _plural(noun)}"
+
+
+def _plural(noun: str) -> str:
+    if re.search("[^aeiou]y$", noun):
+        return f"{noun[:-1]}ies"
+    return f"{noun}es" if re.search("(s|x|ch|sh)$", noun) else f"{noun}s"
 
 
 class JSONError(ValueError):

@@ -21,17 +21,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from ..inputs.display import (
-    brief_repr,
-    brief_table,
-    counted,
-    fields_of,
-    joined,
-    readable,
-    shown_briefly,
-    told_steps,
-)
-from ..inputs.text import JSONError, JSONSyntaxError, listed, parsed_json, shortened
+from ..inputs.display import brief_repr, brief_table, fields_of, joined, readable, shown_briefly, step_range
+from ..inputs.text import JSONError, JSONSyntaxError, counted, listed, parsed_json, shortened
 from ..process.mdp import TabularMDP
 
 PAD, SEEN, HIDDEN, LOST = 0, 1, 2, 3
@@ -116,7 +107,7 @@ class Demonstration:
         if not readable(self.kind) or np.ndim(self.kind) != 2:
             return None
         kind = np.asarray(self.kind)
-        n, steps = counted(len(kind), "trajectory", "trajectories"), told_steps(self.lengths)
+        n, steps = counted(len(kind), "trajectory"), step_range(self.lengths)
         kinds = (("seen", SEEN), ("hidden", HIDDEN), ("lost", LOST))
         return [("trajectories", n), ("steps", steps), *((name, str((kind == k).sum())) for name, k in kinds)]
 

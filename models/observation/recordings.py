@@ -16,16 +16,8 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from ..inputs.arguments import as_key, concrete, described, rebuilt_unchecked
-from ..inputs.display import (
-    brief_repr,
-    brief_table,
-    counted,
-    fields_of,
-    joined,
-    readable,
-    shown_briefly,
-    told_steps,
-)
+from ..inputs.display import brief_repr, brief_table, fields_of, joined, readable, shown_briefly, step_range
+from ..inputs.text import counted
 
 MOUNTAIN_CAR_SHIFT = 0.1 * 1.8 / 10
 """One percent of the range of positions of mountain car, 1.8 (section 7.4.3)."""
@@ -73,8 +65,8 @@ class Recording(NamedTuple):
             if hasattr(x, "shape") and hasattr(x, "dtype")
         ]
         return [
-            ("trajectories", counted(len(self.live), "trajectory", "trajectories")),
-            ("steps", told_steps(self.lengths)),
+            ("trajectories", counted(len(self.live), "trajectory")),
+            ("steps", step_range(self.lengths)),
             *parts,
             ("terminated", f"{int(np.sum(np.asarray(self.terminated)))} terminated"),
         ]

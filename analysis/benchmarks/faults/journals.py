@@ -101,7 +101,7 @@ def learn(path: Path, sessions: int, committed: Callable[[int], object] = lambda
             committed(session)
 
 
-def told(content: Content) -> list[tuple]:
+def progress_line(content: Content) -> list[tuple]:
     """Return a journal's content without the clock."""
     return [*content.sessions, *content.state]
 
@@ -139,7 +139,7 @@ def outcome(left: Left, peace: Content) -> Outcome:
         learn(left.path, total)
     except JournalError as error:
         return Outcome(left.case, left.result, str(error))
-    same = told(content(left.path)) == told(peace)
+    same = progress_line(content(left.path)) == progress_line(peace)
     return Outcome(left.case, left.result, "" if same else "it ended with other bits")
 
 
@@ -369,7 +369,7 @@ def _judged(path: Path, end: Content, sessions: int) -> tuple[str, str]:
         return "wrong", f"learning raised {type(error).__name__}: {error}"
     if done not in ([], [sessions + 1]) or (learned == "right" and not done):
         return "wrong", f"sessions {done} were learned"
-    if learned == "right" and shown == "right" and told(content(path)) != told(end):
+    if learned == "right" and shown == "right" and progress_line(content(path)) != progress_line(end):
         return "wrong", "it ended with other bits"
     return f"shown: {shown}; learned: {learned}", ""
 

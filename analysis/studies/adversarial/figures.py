@@ -13,6 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Polygon
 from matplotlib.ticker import MaxNLocator, PercentFormatter, StrMethodFormatter
 
+from ....models.inputs.text import counted
 from ...drawing.style import (
     SMALL,
     TEXT,
@@ -26,7 +27,7 @@ from ...drawing.style import (
     name_ticks,
     new_figure,
 )
-from ...drawing.text import counted, for_figure, listed
+from ...drawing.text import for_figure, listed
 from ...judging.returns import Correlation, seed_interval
 from .results import (
     LEARNED,

@@ -15,11 +15,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from ....models.inputs.text import counted
 from ....models.process.mdp import TabularMDP
 from ...drawing.page import Lead, Picture, Section, Table, drawn, write_page
 from ...drawing.page import print_tables as print_page_tables
 from ...drawing.results import study_provenance
-from ...drawing.text import counted, listed
+from ...drawing.text import listed
 from ...judging.returns import Correlation, Recovery, empirical_ile, seed_interval
 from ..noisy.examples import Strip
 from . import figures

@@ -15,6 +15,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import PercentFormatter
 
+from ....models.inputs.text import counted
 from ...drawing.charts import set_scale
 from ...drawing.style import (
     SMALL,
@@ -28,7 +29,6 @@ from ...drawing.style import (
     save_themes,
     series_style,
 )
-from ...drawing.text import counted
 from .patrol import interval
 
 Results = Mapping[str, Mapping[str, Any]]

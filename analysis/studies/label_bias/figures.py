@@ -10,6 +10,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch, Rectangle
 
+from ....models.inputs.text import counted
 from ...drawing.charts import set_scale
 from ...drawing.style import (
     SMALL,
@@ -23,7 +24,7 @@ from ...drawing.style import (
     new_figure,
     series_style,
 )
-from ...drawing.text import counted, number
+from ...drawing.text import number
 
 if TYPE_CHECKING:
     from .study import LabelBiasStudy

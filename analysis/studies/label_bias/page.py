@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ....models.inputs.text import counted
 from ...drawing.page import Lead, Section, Table, drawn, write_page
 from ...drawing.page import print_tables as print_page_tables
 from ...drawing.results import plain, study_provenance
-from ...drawing.text import NOTHING, counted, number
+from ...drawing.text import NOTHING, number
 from . import figures
 from .study import (
     DISCOUNT,
@@ -83,7 +84,7 @@ def _summary(study: LabelBiasStudy) -> dict[str, Any]:
 
 
 def _tables(study: LabelBiasStudy) -> tuple[Table, ...]:
-    def told(c: Correlation) -> tuple[str, ...]:
+    def progress_line(c: Correlation) -> tuple[str, ...]:
         if np.isnan(c.rho):
             return "none", NOTHING, NOTHING, f"{c.n}"
         return f"{c.rho:.4f}", f"{c.low:.2f} to {c.high:.2f}", tell_p(c.p), f"{c.n}"
@@ -91,9 +92,9 @@ def _tables(study: LabelBiasStudy) -> tuple[Table, ...]:
     table = Table(
         ("", "rho", "95 % interval", "p", "n"),
         [
-            ("BIRL", *told(study.birl)),
+            ("BIRL", *progress_line(study.birl)),
             ("dissertation, BIRL", f"{PRINTED_RHO}", "not given", f"{PRINTED_P}", "75"),
-            ("MaxEnt", *told(study.maxent)),
+            ("MaxEnt", *progress_line(study.maxent)),
             ("dissertation, MaxEnt", "1.0", "not given", "0.0", "75"),
         ],
         f"Log-likelihood and total reward in the median world of {study.results[0].setting.name}; MaxEnt's "

@@ -8,11 +8,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ....domains.labyrinth.process import SHARED_FEATURES
+from ....models.inputs.text import counted
 from ...drawing.estimates import Estimates
 from ...drawing.page import Lead, Section, Table, drawn, write_page
 from ...drawing.page import print_tables as print_page_tables
 from ...drawing.results import plain, study_provenance
-from ...drawing.text import counted, listed, number
+from ...drawing.text import listed, number
 from .study import BY_LEVEL, LEARNER, PLACES, UNIFORM, LabyrinthStudy, ViewStudy, bits_per_decision
 
 if TYPE_CHECKING:

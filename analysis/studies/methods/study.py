@@ -23,6 +23,7 @@ from ....inference.learners.jin import jin_i2rl, jin_i2rl_with_features
 from ....inference.learners.lme import lme_i2rl, lme_i2rl_with_random_weights, me_i2rl
 from ....inference.sessions.learner import Learner
 from ....inference.sessions.running import run_sessions
+from ....models.inputs.text import counted
 from ....models.observation.demonstration import SEEN, Demonstration
 from ....models.observation.evidence import Sensor
 from ....models.process.mdp import TabularMDP
@@ -32,7 +33,7 @@ from ...drawing.page import Lead, Section, Table, drawn, write_page
 from ...drawing.page import print_tables as print_page_tables
 from ...drawing.results import plain, study_provenance
 from ...drawing.style import Theme, dress, foot, head, method_styles, new_figure
-from ...drawing.text import counted, number
+from ...drawing.text import number
 from ...judging.metrics import behaviour_accuracies, chance_accuracy, optimal_actions, quantile_band
 from ...posteriors.information import complete_information
 

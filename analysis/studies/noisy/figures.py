@@ -12,6 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import MaxNLocator, PercentFormatter
 
+from ....models.inputs.text import counted
 from ....models.process.mdp import TabularMDP
 from ...drawing.charts import set_scale
 from ...drawing.style import (
@@ -27,7 +28,6 @@ from ...drawing.style import (
     name_ticks,
     new_figure,
 )
-from ...drawing.text import counted
 from ...judging.metrics import quantile_band
 from .examples import SensorPosterior, Strip
 from .study import (

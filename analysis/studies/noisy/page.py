@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
+from ....models.inputs.text import counted
 from ...drawing.page import Lead, Section, Table, drawn, write_page
 from ...drawing.page import print_tables as print_page_tables
 from ...drawing.results import plain, study_provenance
 from ...drawing.style import Theme
-from ...drawing.text import counted, number
+from ...drawing.text import number
 from ...judging.metrics import quantile_band
 from ..sorting.table import SortingTable, caption, sorting_table_plot, sorting_table_summary
 from . import figures

@@ -26,6 +26,7 @@ from ....inference.completion.smoothing import evidence_of, smooth_all
 from ....inference.learners.lme import batch_lme, lme_i2rl, lme_i2rl_with_random_weights
 from ....inference.sessions.learner import Learner
 from ....inference.sessions.running import run_sessions
+from ....models.inputs.text import counted
 from ....models.observation.demonstration import SEEN, Demonstration, concatenate
 from ....models.observation.evidence import observe
 from ....models.process.planning import reward_of, soft_plan
@@ -42,7 +43,7 @@ from ...drawing.page import Lead, Section, Table, drawn, write_page
 from ...drawing.page import print_tables as print_page_tables
 from ...drawing.results import plain, study_provenance
 from ...drawing.style import Theme
-from ...drawing.text import counted, listed, number
+from ...drawing.text import listed, number
 from ...judging.metrics import chance_accuracy, demonstration_log_likelihoods, evaluate
 from ...posteriors.identifiability import Identifiability, identifiability_of, identifiability_section
 

@@ -27,12 +27,12 @@ from ....domains.sorting.process import (
     UNKNOWN,
     Sorting,
 )
+from ....models.inputs.text import counted
 from ....models.observation.demonstration import PAD, Demonstration
 from ....models.process.mdp import TabularMDP
 from ....models.process.planning import finite_occupancy, reachable_states
 from ...drawing.charts import set_scale
 from ...drawing.style import MARKERS, SMALL, TEXT, Theme, dress, foot, head, method_styles, new_figure
-from ...drawing.text import counted
 from ...judging.metrics import greedy_policy, optimal_actions, policy_accuracy
 from ...judging.multi_task import match_components
 

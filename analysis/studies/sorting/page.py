@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from ....inference.learners.mtirl import DEFAULT_RESTARTS
+from ....models.inputs.text import counted
 from ....models.observation.demonstration import SEEN
 from ...drawing.estimates import Estimates, laplace_errors
 from ...drawing.page import Lead, Section, Table, drawn, write_page
 from ...drawing.page import print_tables as print_page_tables
 from ...drawing.results import plain, study_provenance
-from ...drawing.text import counted, listed, number
+from ...drawing.text import listed, number
 from ...judging.multi_task import match_components
 from ...posteriors.information import complete_information
 from . import figures

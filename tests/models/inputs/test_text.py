@@ -15,7 +15,8 @@ from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from i2rl.analysis.drawing.text import counted, for_figure, for_page, for_terminal, listed, number, printable
+from i2rl.analysis.drawing.text import for_figure, for_page, for_terminal, listed, number, printable
+from i2rl.models.inputs.text import counted
 
 NAMES = [
     "speed [m/s]",

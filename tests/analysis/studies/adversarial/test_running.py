@@ -33,7 +33,7 @@ TRIALS, SESSIONS = 3, 2
 
 
 @pytest.fixture(scope="module")
-def told(tmp_path_factory):
+def progress_line(tmp_path_factory):
     """Return the folder of a tiny page, and the JSON printed with it."""
     folder = tmp_path_factory.mktemp("report")
     small = partial(patrol_results, trials=TRIALS, iterations=3)
