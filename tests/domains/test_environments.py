@@ -163,7 +163,7 @@ def test_episodes_begin_where_they_are_told():
             environment.reset(options={"state": state})
     with pytest.raises(ValueError, match="no state named 'nowhere'"):
         environment.reset(options={"state": "nowhere"})
-    with pytest.raises(ValueError, match="option 'state' only, got 'speed'"):
+    with pytest.raises(ValueError, match="only the option 'state', got 'speed'"):
         environment.reset(options={"speed": 2})
 
 

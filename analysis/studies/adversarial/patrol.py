@@ -231,8 +231,7 @@ def patrol_results(
     if not 0 < noise * LEVEL <= 1:
         raise ValueError(
             f"noise multiplies the probability of {LEVEL:g} that an observation errs; it must be "
-            f"above 0 and at "
-            f"most {1 / LEVEL:g}; got {noise}"
+            f"above 0 and at most {1 / LEVEL:g}; got {noise}"
         )
     level, patrol = noise * LEVEL, instance(2)
     streams = noisy_streams(patrol, level, replications, sessions)

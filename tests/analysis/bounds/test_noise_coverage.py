@@ -42,7 +42,7 @@ def test_reliabilities_are_counted_without_bias():
 
 def test_predicates_that_depend_on_each_other_are_refused():
     twice = np.array([[[0, 1]], [[0, 1]]])
-    with pytest.raises(ValueError, match="predicates are not independent"):
+    with pytest.raises(ValueError, match="predicates must be independent"):
         counted_reliabilities(jax.random.key(0), FeatureNoise(twice, np.full(2, 0.8)), 2, 10)
 
 

@@ -402,7 +402,7 @@ def test_errors(random_mdp):
     mdp = random_mdp(0)
     demo = Demonstration.from_pairs(np.array([[0]]), np.array([[0]]))
     examine = partial(identifiability_of, mdp, Sensor())
-    with pytest.raises(ValueError, match="no steps"):
+    with pytest.raises(ValueError, match="must have steps"):
         examine(Demonstration.from_pairs(np.zeros((0, 2)), np.zeros((0, 2))))
     with pytest.raises(ValueError, match="scale must be positive, got 0"):
         examine(demo, scale=0.0)

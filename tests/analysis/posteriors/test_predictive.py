@@ -166,7 +166,7 @@ def test_a_posterior_keeps_its_groups_and_goes_into_a_file(sure, mdp, sensor, de
 def test_what_cannot_be_checked_is_refused(sure, mdp, sensor, demonstration):
     with pytest.raises(InferenceDataError, match=r"has no demonstration .* give it as an argument"):
         predictive_visits(jax.random.key(0), sure, mdp, sensor)
-    with pytest.raises(ValueError, match="no trajectories"):
+    with pytest.raises(ValueError, match="must have trajectories"):
         predictive_visits(jax.random.key(0), sure, mdp, sensor, demonstration.select([]))
     with pytest.raises(InferenceDataError, match="no visits in posterior_predictive"):
         predictive_check(sure)

@@ -145,7 +145,7 @@ def test_misuse_is_told():
     for given in ([0], [0, 124], [0, -1], [0.5, 1.5], "ab"):
         with pytest.raises(ValueError, match="patrollers must be 2 states of 0 to 123"):
             environment.reset(options={"patrollers": given})
-    with pytest.raises(ValueError, match="option 'patrollers' only, got 'state'"):
+    with pytest.raises(ValueError, match="only the option 'patrollers', got 'state'"):
         environment.reset(options={"state": 0})
     environment.reset(seed=0)
     with pytest.raises(ValueError, match="actions are 0 to 3, got 4"):

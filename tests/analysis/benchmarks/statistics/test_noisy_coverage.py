@@ -75,7 +75,7 @@ def test_bad_input_is_refused_in_its_own_terms():
         covers(np.zeros((4, 1)), np.zeros(1), 1.0)
     with pytest.raises(ValueError, match="4 draws cannot be thinned to 5"):
         rank_among(np.zeros((4, 1)), np.zeros(1), 5)
-    with pytest.raises(ValueError, match="at least one run"):
+    with pytest.raises(ValueError, match="at least one replication"):
         judge(("one",), [])
     with pytest.raises(ValueError, match="replications must be at least 1"):
         next(replicate(jax.random.key(0), corridor(), 0))
