@@ -15,7 +15,7 @@ import pytest
 from hypothesis import settings
 
 from i2rl.analysis.drawing.page import GLOSSARY
-from i2rl.compilation import keep_programs
+from i2rl.compilation import compile_quickly, keep_programs
 from i2rl.models import Demonstration, TabularMDP
 from i2rl.models.observation.demonstration import HIDDEN, LOST, PAD, SEEN, UNKNOWN
 from i2rl.models.observation.evidence import observe
@@ -25,6 +25,7 @@ settings.register_profile("deterministic", derandomize=True, deadline=None, max_
 settings.load_profile("deterministic")
 
 # For this process, for other workers and for the commands that tests start.
+compile_quickly()
 keep_programs()
 
 

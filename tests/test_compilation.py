@@ -94,3 +94,21 @@ def test_programs_that_were_not_used_for_longest_are_removed_beyond_the_bound(tm
         os.utime(path, (now - age, now - age))
     keep_programs()
     assert {path.name for path in entries(folder)} == {"0", "1", "2", "3", "4"}
+
+
+LEVEL = """
+import os
+from i2rl.compilation import compile_quickly
+compile_quickly()
+print(os.environ["XLA_FLAGS"])
+import jax, jax.numpy as jnp
+jax.jit(jnp.sin)(1.0).block_until_ready()
+"""
+
+
+def test_programs_are_compiled_at_the_first_level_unless_one_is_named():
+    assert run(LEVEL, XLA_FLAGS="").stdout.strip() == "--xla_backend_optimization_level=1"
+    fast = "--xla_cpu_enable_fast_math=true"
+    assert run(LEVEL, XLA_FLAGS=fast).stdout.strip() == f"{fast} --xla_backend_optimization_level=1"
+    named = "--xla_backend_optimization_level=2"
+    assert run(LEVEL, XLA_FLAGS=named).stdout.strip() == named

@@ -14,7 +14,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperGroup
 
-from ...compilation import keep_programs
+from ...compilation import compile_quickly, keep_programs
 from . import run, simulate
 from .bounds import print_bounds
 from .console import show_progress
@@ -87,6 +87,7 @@ def main() -> None:
     sys.unraisablehook = _interrupt_again
     if sys.stdout is None:  # closed by whoever started this
         sys.stdout = open(os.devnull, "w")  # noqa: SIM115
+    compile_quickly()
     keep_programs()
     app()
 

@@ -6,7 +6,8 @@ expert, and loss of value. Everything is exact: no simulation, no offset, no res
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +28,8 @@ from ...models.process.planning import (
     reward_of,
     soft_plan,
 )
+
+Judged = TypeVar("Judged")
 
 
 class Accuracy(NamedTuple):
@@ -193,12 +196,12 @@ def learned_value(
 
 
 def evaluate(
-    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
+    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, "*n K"]
 ) -> Evaluation:
     """Compute all measures above for the cost of one of them.
 
-    Maps over learned weights ``[N, K]`` with ``jax.vmap(partial(evaluate, mdp, true_weights))``. Raises
-    ``ValueError`` as :func:`greedy_policy` does.
+    Many learned weights ``[..., K]`` are evaluated by one program, one after another; each measure then has
+    their leading axes. Raises ``ValueError`` as :func:`greedy_policy` does.
 
     See Also
     --------
@@ -217,16 +220,17 @@ def evaluate(
     >>> round(float(judged.value), 1), round(float(judged.best_value), 1)
     (0.0, 11.8)
     """
-    return _evaluate(mdp, _checked(mdp, true_weights), _checked(mdp, learned_weights))
+    return _evaluate(mdp, _checked(mdp, true_weights), _checked(mdp, learned_weights, many=True))
 
 
 def demonstration_log_likelihoods(
-    mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, " K"], demonstration: Demonstration
-) -> Float[Array, " n"]:
+    mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, "*m K"], demonstration: Demonstration
+) -> Float[Array, "*m n"]:
     """Compute the exact log-likelihood (nats) of each trajectory under the soft policy of ``weights``.
 
     Hidden steps are summed out (section 1 of the methods); ``-inf`` for a trajectory the model rules out.
-    Errors as for :func:`greedy_policy`, and ``ValueError`` for a sensor made for another MDP.
+    Many weights ``[..., K]`` are judged by one program; the trajectories are then the last axis. Errors as
+    for :func:`greedy_policy`, and ``ValueError`` for a sensor made for another MDP.
 
     See Also
     --------
@@ -246,21 +250,31 @@ def demonstration_log_likelihoods(
     # Padded to a power of two, so that demonstrations of many sizes share a compiled program.
     sensor, demonstration = fitting_sensor(sensor, mdp), checked_demonstration(mdp, demonstration)
     padded = demonstration.bucketed()
-    return _log_likelihoods(mdp, sensor, _checked(mdp, weights), padded)[: demonstration.n_trajectories]
+    each = _log_likelihoods(mdp, sensor, _checked(mdp, weights, many=True), padded)
+    return each[..., : demonstration.n_trajectories]
 
 
-def _checked(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, " K"]:
+def _checked(mdp: TabularMDP, weights: Float[Array, "*n K"], *, many: bool = False) -> Float[Array, "*n K"]:
     require_discounted(mdp)
     weights = jnp.asarray(weights, float)
-    if weights.shape != (mdp.n_features,):
+    if (weights.shape[-1:] if many else weights.shape) != (mdp.n_features,):
         raise ValueError(f"weights must have shape [{mdp.n_features}], one a feature, got {weights.shape}")
     # A learner that failed must not be scored by whatever argmax makes of NaN.
     if not isinstance(weights, jax.core.Tracer) and not np.isfinite(weights).all():
-        k = int(np.flatnonzero(~np.isfinite(weights))[0])
+        at = tuple(np.argwhere(~np.isfinite(weights))[0])
         raise ValueError(
-            f"the weight of feature {shortened(mdp.feature_names[k])} is {weights[k]}, not a number"
+            f"the weight of feature {shortened(mdp.feature_names[at[-1]])} is {weights[at]}, not a number"
         )
     return weights
+
+
+def _of_each(judge: Callable[[Float[Array, " K"]], Judged], weights: Float[Array, "*n K"]) -> Judged:
+    """Judge all weights one after another: as a batch they would leave the cache of the processor."""
+    if weights.ndim == 1:
+        return judge(weights)
+    lead = weights.shape[:-1]
+    judged = lax.map(judge, weights.reshape(-1, weights.shape[-1]))
+    return jax.tree.map(lambda x: x.reshape(*lead, *x.shape[1:]), judged)
 
 
 @jax.jit
@@ -283,18 +297,22 @@ def _policy_error(
 
 @jax.jit
 def _evaluate(
-    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
+    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, "*n K"]
 ) -> Evaluation:
     reward = reward_of(mdp, true_weights)
     best = hard_plan(mdp, reward)
-    policy = _greedy(mdp, learned_weights)
-    values = policy_values(mdp, policy, reward)
-    return Evaluation(
-        policy_accuracy(mdp, best.optimal, policy),
-        _error(best.values, values),
-        mdp.initial @ values,
-        mdp.initial @ best.values,
-    )
+
+    def judge(weights: Float[Array, " K"]) -> Evaluation:
+        policy = _greedy(mdp, weights)
+        values = policy_values(mdp, policy, reward)
+        return Evaluation(
+            policy_accuracy(mdp, best.optimal, policy),
+            _error(best.values, values),
+            mdp.initial @ values,
+            mdp.initial @ best.values,
+        )
+
+    return _of_each(judge, learned_weights)
 
 
 def _error(best: Float[Array, " S"], values: Float[Array, " S"]) -> LearningError:
@@ -304,10 +322,14 @@ def _error(best: Float[Array, " S"], values: Float[Array, " S"]) -> LearningErro
 
 @jax.jit
 def _log_likelihoods(
-    mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, " K"], demonstration: Demonstration
-) -> Float[Array, " n"]:
-    log_policy = soft_plan(mdp, reward_of(mdp, weights)).log_policy
-    return log_likelihoods(mdp, log_policy, evidence_of(mdp, sensor, demonstration))
+    mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, "*m K"], demonstration: Demonstration
+) -> Float[Array, "*m n"]:
+    evidence = evidence_of(mdp, sensor, demonstration)
+
+    def judge(weights: Float[Array, " K"]) -> Float[Array, " n"]:
+        return log_likelihoods(mdp, soft_plan(mdp, reward_of(mdp, weights)).log_policy, evidence)
+
+    return _of_each(judge, weights)
 
 
 # -- how sure the numbers are -------------------------------------------------------------------------

@@ -25,7 +25,7 @@ from nbclient import NotebookClient
 from nbformat import NotebookNode
 from PIL import Image
 
-from ...compilation import keep_programs
+from ...compilation import compile_quickly, keep_programs
 
 FOLDER = Path(__file__).parent
 _METADATA = {
@@ -138,6 +138,7 @@ def _reduced(picture: str) -> str:
 
 def main(paths: Sequence[str] = ()) -> None:
     """Execute notebooks in place (all of the package's by default) and say how long each took."""
+    compile_quickly()
     keep_programs()
     for path in map(Path, paths or notebooks()):
         began = time.perf_counter()

@@ -73,10 +73,10 @@ class BreachTask(NamedTuple):
 
 @shown_briefly
 class BreachPlan(NamedTuple):
-    """Optimal values ``[T, X]`` at each step of the plan, and the best move (index into ``MOVES``)."""
+    """Optimal values ``[T, X, *n]`` at each step of the plan, and the best move (index into ``MOVES``)."""
 
-    values: Float[Array, "T X"]
-    moves: Int[Array, "T X"]
+    values: Float[Array, "T X *n"]
+    moves: Int[Array, "T X *n"]
 
 
 def line_of_sight(patrol: Patrol, reach: float) -> Bool[np.ndarray, "C S"]:
@@ -191,6 +191,10 @@ def current_beliefs(
     return jax.vmap(one)(log_policies, jnp.asarray(codes))
 
 
+Detection = Callable[[Array, Float[Array, "P S"]], Float[Array, "T C"]]
+"""Probabilities of detection in each cell at each step to come, from a key and the beliefs."""
+
+
 class IndependentForecast(NamedTuple):
     """Exact marginals of each patroller walking alone; their meetings are left out (the default)."""
 
@@ -212,6 +216,34 @@ class IndependentForecast(NamedTuple):
 
         marginals: Array = lax.scan(step, beliefs, None, horizon)[1]
         return jnp.swapaxes(marginals, 0, 1)
+
+    def detection(
+        self,
+        mdp: TabularMDP,
+        cells: Int[Array, " S"],
+        log_policies: Float[Array, "P S A"],
+        sees: Float[Array, "C S"],
+        horizon: int,
+    ) -> Detection:
+        """Return :func:`detection_probability` of the forecast as a function of key and beliefs.
+
+        What a patroller sees after ``t`` steps from each state depends on its policy alone and is computed
+        once: a belief then takes one product instead of a walk of ``horizon`` steps.
+        """
+        del cells
+        chains = jax.vmap(mdp.state_transitions)(jnp.exp(log_policies))
+
+        def step(seen: Float[Array, "P S C"], _: None) -> tuple:
+            return chains @ seen, seen
+
+        first = jnp.broadcast_to(sees.T, (len(chains), *sees.T.shape))
+        seen: Array = lax.scan(step, first, None, horizon)[1]  # [T, P, S, C]
+
+        def detect(key: Array, beliefs: Float[Array, "P S"]) -> Float[Array, "T C"]:
+            del key
+            return _any_of(jnp.einsum("ps,tpsc->ptc", beliefs, seen))
+
+        return detect
 
 
 class SimulatedForecast(NamedTuple):
@@ -242,41 +274,61 @@ class SimulatedForecast(NamedTuple):
         empty = jnp.zeros((beliefs.shape[0], horizon, mdp.n_states))
         return empty.at[patroller, time, states].add(1 / self.draws)
 
+    def detection(
+        self,
+        mdp: TabularMDP,
+        cells: Int[Array, " S"],
+        log_policies: Float[Array, "P S A"],
+        sees: Float[Array, "C S"],
+        horizon: int,
+    ) -> Detection:
+        """Return :func:`detection_probability` of the forecast as a function of key and beliefs."""
+
+        def detect(key: Array, beliefs: Float[Array, "P S"]) -> Float[Array, "T C"]:
+            return detection_probability(sees, self(key, mdp, cells, log_policies, beliefs, horizon))
+
+        return detect
+
 
 Forecast = IndependentForecast | SimulatedForecast
 
 
 def detection_probability(sees: Float[Array, "C S"], marginals: Float[Array, "P T S"]) -> Float[Array, "T C"]:
     """Compute ``1 - prod_i (1 - d_i)``, the probability of detection by independent patrollers."""
-    return 1 - jnp.prod(1 - jnp.einsum("cs,pts->ptc", sees, marginals), axis=0)
+    return _any_of(jnp.einsum("cs,pts->ptc", sees, marginals))
+
+
+def _any_of(probabilities: Float[Array, "P T C"]) -> Float[Array, "T C"]:
+    return 1 - jnp.prod(1 - probabilities, axis=0)
 
 
 # -- planning -----------------------------------------------------------------------------------------
 
 
-def plan_breach(task: BreachTask, detection: Float[Array, "T C"], settings: BreachSettings) -> BreachPlan:
+def plan_breach(task: BreachTask, detection: Float[Array, "T C *n"], settings: BreachSettings) -> BreachPlan:
     """Compute the optimal plan against predicted patrollers, exactly, by one backward recursion.
 
     At each step the learner is first detected, with the probability ``detection [T, C]`` gives for its cell
     (it is caught and pays the penalty), and otherwise moves. A goal ends the trial and pays the reward; the
-    last step pays zero.
+    last step pays zero. Axes after the first two hold plans of their own: many plans at once are several
+    times faster so than under ``vmap``, which puts their axis first.
     """
-    goal_value = jnp.where(task.goal, settings.reward, 0.0)
+    goal = task.goal.reshape(-1, *[1] * (detection.ndim - 2))
+    goal_value = jnp.where(goal, settings.reward, 0.0)
+    slip = settings.failure / 2  # to each of the other two moves
 
-    def back(values: Float[Array, " X"], detected: Float[Array, " C"]) -> tuple:
-        onward = _expected_values(task, values, settings.failure)
-        caught = detected[task.cell][:, None]
-        q = task.discount * ((1 - caught) * onward - caught * settings.penalty)
-        values = jnp.where(task.goal, goal_value, jnp.max(q, axis=1))
-        return values, (values, jnp.argmax(q, axis=1))
+    def back(values: Float[Array, " X *n"], detected: Float[Array, " C *n"]) -> tuple:
+        forward, left, right = (values[task.following[:, move]] for move in range(len(MOVES)))
+        best = jnp.maximum(forward, jnp.maximum(left, right))
+        onward = slip * (forward + left + right) + (1 - 3 * slip) * best
+        caught = detected[task.cell]
+        value = task.discount * ((1 - caught) * onward - caught * settings.penalty)
+        values = jnp.where(goal, goal_value, value)
+        moves = jnp.where(forward >= best, 0, jnp.where(left >= best, 1, 2))
+        return values, (values, moves)
 
-    last = jnp.zeros(task.goal.shape)
-    swept: tuple = lax.scan(back, last, detection[:-1], reverse=True)[1]
-    values, moves = swept
-    return BreachPlan(jnp.concatenate([values, last[None]]), jnp.pad(moves, ((0, 1), (0, 0))))
-
-
-def _expected_values(task: BreachTask, values: Float[Array, " X"], failure: float) -> Float[Array, "X 3"]:
-    intended = values[task.following]
-    others = (jnp.sum(intended, axis=1, keepdims=True) - intended) / 2
-    return (1 - failure) * intended + failure * others
+    last = jnp.zeros((len(task.goal), *detection.shape[2:]))
+    values, moves = lax.scan(back, last, detection[:-1], reverse=True)[1]
+    return BreachPlan(
+        jnp.concatenate([values, last[None]]), jnp.concatenate([moves, jnp.zeros_like(moves[:1])])
+    )

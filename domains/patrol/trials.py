@@ -28,7 +28,6 @@ from .breach import (
     IndependentForecast,
     Watcher,
     breach_task,
-    detection_probability,
     plan_breach,
     watch,
 )
@@ -36,6 +35,7 @@ from .process import SECONDS_PER_STEP, Interaction, Patrol, greedy_policy, simul
 
 REACHED, CAUGHT, TIMED_OUT, RAN_OUT = range(4)
 OUTCOMES = ("reached", "caught", "timed out", "ran out")
+CHUNK = 64
 
 # -- when to go ---------------------------------------------------------------------------------------
 
@@ -320,49 +320,65 @@ def _trials(
     horizon, length, interaction = lengths
     patrollers = jnp.arange(log_policies.shape[0])
     lost = jnp.array([LOST, UNKNOWN, UNKNOWN])
+    detection = forecast.detection(mdp, cells, log_policies, task.sees, horizon)
 
-    def trial(key: Array, ready: Int[Array, ""]) -> tuple:
-        first, patrol_key, look, go_key, predict_key, walk_key = jax.random.split(key, 6)
+    def patrolled(key: Array, look: Array, first: Array) -> tuple[Int[Array, "P N"], Int[Array, "P N 3"]]:
         start = jax.random.categorical(first, jnp.log(mdp.initial), shape=patrollers.shape)
-        states, actions = simulate_patrollers(
-            patrol_key, mdp, cells, true_policies, start, *interaction, length
-        )
+        states, actions = simulate_patrollers(key, mdp, cells, true_policies, start, *interaction, length)
         codes = jax.vmap(lambda p: observe(jax.random.fold_in(look, p), view, states[p], actions[p]))(
             patrollers
         )
+        return states, codes
 
-        def perceive(t: Int[Array, ""], beliefs: Float[Array, "P S"]) -> Float[Array, "P S"]:
-            seen = jnp.where((t < observed) | (t >= ready), codes[:, t], lost)
-            return jax.vmap(lambda p, b, c: watcher(mdp, p, view, b, c))(log_policies, beliefs, seen)
+    def perceive(
+        codes: Int[Array, "P N 3"], ready: Int[Array, ""], t: Int[Array, ""], beliefs: Float[Array, "P S"]
+    ) -> Float[Array, "P S"]:
+        seen = jnp.where((t < observed) | (t >= ready), codes[:, t], lost)
+        return jax.vmap(lambda p, b, c: watcher(mdp, p, view, b, c))(log_policies, beliefs, seen)
 
-        def plan(now: Int[Array, ""], beliefs: Float[Array, "P S"]) -> BreachPlan:
-            marginals = forecast(
-                jax.random.fold_in(predict_key, now), mdp, cells, log_policies, beliefs, horizon
-            )
-            return plan_breach(task, detection_probability(task.sees, marginals), believed)
+    def learned(codes: Int[Array, "P N 3"], ready: Int[Array, ""]) -> Float[Array, "P S"]:
+        beliefs = jnp.broadcast_to(mdp.initial, (*patrollers.shape, mdp.n_states))
+        return lax.fori_loop(0, jnp.minimum(ready, length), partial(perceive, codes, ready), beliefs)
 
-        def decide(now: Int[Array, ""], beliefs: Float[Array, "P S"]) -> tuple:
-            values = plan(now, beliefs).values[:, task.start]
+    def chunk(inputs: tuple[Array, Int[Array, " n"]]) -> tuple[Int[Array, " n"], Float[Array, " n"]]:
+        keys, ready = inputs
+        first, patrol_key, look, go_key, predict_key, walk_key = jax.vmap(
+            lambda key: jax.random.split(key, 6), out_axes=1
+        )(keys)
+        states, codes = jax.vmap(patrolled)(patrol_key, look, first)
+
+        def plan(now: Int[Array, " n"], beliefs: Float[Array, "n P S"]) -> BreachPlan:
+            at = jax.vmap(jax.random.fold_in)(predict_key, now)
+            return plan_breach(task, jax.vmap(detection, out_axes=-1)(at, beliefs), believed)
+
+        def decide(now: Int[Array, " n"], beliefs: Float[Array, "n P S"]) -> tuple:
+            values = plan(now, beliefs).values[:, task.start].T
             left = deadline - now
-            allowed = jnp.where(jnp.arange(horizon) <= left, values, -jnp.inf)
-            return go(go_key, now - ready, left, allowed)
+            allowed = jnp.where(jnp.arange(horizon) <= left[:, None], values, -jnp.inf)
+            return jax.vmap(go)(go_key, now - ready, left, allowed)
+
+        def waiting(now: Int[Array, " n"], settled: Bool[Array, " n"]) -> Bool[Array, " n"]:
+            return (now <= deadline) & ~settled
 
         def wait(carry: tuple) -> tuple:
             now, beliefs, settled, offset = carry
-            settled, offset = decide(now, beliefs)
-            following = jnp.where(settled, beliefs, perceive(now, beliefs))
-            return jnp.where(settled, now, now + 1), following, settled, offset
+            here = waiting(now, settled)
+            decided, departure = decide(now, beliefs)
+            offset = jnp.where(here, departure, offset)
+            settled = settled | (here & decided)
+            stays = here & ~decided
+            seen = jax.vmap(perceive)(codes, ready, now, beliefs)
+            beliefs = jnp.where(stays[:, None, None], seen, beliefs)
+            return now + stays, beliefs, settled, offset
 
-        beliefs = jnp.broadcast_to(mdp.initial, (*patrollers.shape, mdp.n_states))
-        beliefs = lax.fori_loop(0, jnp.minimum(ready, length), perceive, beliefs)
         now, beliefs, settled, offset = lax.while_loop(
-            lambda carry: (carry[0] <= deadline) & ~carry[2],
+            lambda carry: jnp.any(waiting(carry[0], carry[2])),
             wait,
-            (ready, beliefs, jnp.array(False), jnp.zeros((), int)),
+            (ready, jax.vmap(learned)(codes, ready), jnp.zeros(len(keys), bool), jnp.zeros(len(keys), int)),
         )
         moves = plan(now, beliefs).moves
-        seen_by = jnp.any(world.sees[:, states] > 0, axis=1)
-        ended = walk(walk_key, moves, seen_by, now, offset)
+        seen_by = jnp.any(world.sees[:, states] > 0, axis=2)  # [C, n, N]
+        ended = jax.vmap(walk, in_axes=(0, -1, 1, 0, 0))(walk_key, moves, seen_by, now, offset)
         waited = (now + offset - ready) * SECONDS_PER_STEP
         return jnp.where(settled, ended, TIMED_OUT), jnp.where(settled, waited, jnp.nan)
 
@@ -392,8 +408,12 @@ def _trials(
         (_, ended), _ = lax.scan(step, (world.start, jnp.array(-1)), steps)
         return jnp.where(ended < 0, RAN_OUT, ended)
 
-    # In chunks: memory stays bounded, and no run waits for the slowest of all.
-    return lax.map(lambda x: trial(*x), (keys, ready), batch_size=min(256, keys.shape[0]))
+    # In chunks that fit a cache; no trial waits for the slowest of all. The last chunk is filled up.
+    trials = len(keys)
+    size = min(CHUNK, trials)
+    at = jnp.arange(math.ceil(trials / size) * size).reshape(-1, size) % trials
+    ended, waited = lax.map(chunk, (keys[at], ready[at]))
+    return ended.ravel()[:trials], waited.ravel()[:trials]
 
 
 # -- what the learner may take for the patrollers' policies -------------------------------------------

@@ -155,7 +155,18 @@ def _exactly(
 
         return jax.tree.map(chosen, again(mdp, factors, live), plain)
 
-    return lax.cond(jnp.any(forward.lost), repaired, lambda: plain)
+    return lax.cond(_any(lax.stop_gradient(forward.lost)), repaired, lambda: plain)
+
+
+@jax.custom_batching.custom_vmap
+def _any(lost: Bool[Array, "..."]) -> Bool[Array, ""]:
+    """Return one answer for all problems under ``vmap``: with one each, both branches would be computed."""
+    return jnp.any(lost)
+
+
+@_any.def_vmap
+def _any_of_all(axis_size: int, in_batched: list[bool], lost: Bool[Array, "..."]) -> tuple[Array, bool]:
+    return _any(lost), False
 
 
 # -- in plain numbers -----------------------------------------------------------------------------------

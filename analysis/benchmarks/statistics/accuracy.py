@@ -30,7 +30,7 @@ def accuracies(
     """Measure LBA of each method at each number of sessions; a row is a seed and a patroller."""
     patrol = instance(number)
     view = patrol.visibility(observability)
-    score = jax.jit(jax.vmap(partial(evaluate, patrol.mdp, jnp.asarray(patrol.weights))))
+    score = partial(evaluate, patrol.mdp, jnp.asarray(patrol.weights))
     learners = {s: lme_i2rl(patrol.mdp, view, statistic=s) for s in statistics}
     batch = batch_lme(patrol.mdp, view)
     weights: dict[str, list[Any]] = {name: [] for name in (*learners, "batch", "random rewards")}

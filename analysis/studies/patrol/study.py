@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax import lax
 from jaxtyping import Float
 
 from ....domains.patrol.process import SECONDS_PER_STEP, Patrol, demonstrate, instance, simulate_patrol
@@ -291,12 +290,8 @@ def _likelihoods(
     """Compute nats per trajectory of fresh demonstrations, the same for all methods."""
     fresh = concatenate(demonstrate(jax.random.key(10**6), patrol, observability, 60, STEPS_PER_SESSION))
     view = patrol.visibility(observability)
-    likelihood = lax.map(
-        lambda w: jnp.mean(demonstration_log_likelihoods(patrol.mdp, view, w, fresh)),
-        jnp.asarray(weights),
-        batch_size=16,
-    )
-    return np.asarray(likelihood)
+    each = demonstration_log_likelihoods(patrol.mdp, view, jnp.asarray(weights), fresh)
+    return np.asarray(each).mean(axis=1)
 
 
 def _true(patrol: Patrol, key: jax.Array, demonstrations: Sequence[Demonstration]) -> _Learned:
@@ -326,9 +321,7 @@ def _evaluated(
 ) -> MethodResult:
     weights = np.stack([one.weights for one in learned])
     replications, patrollers, n, k = weights.shape
-    scores = jax.vmap(partial(evaluate, patrol.mdp, jnp.asarray(patrol.weights)))(
-        jnp.asarray(weights).reshape(-1, k)
-    )
+    scores = evaluate(patrol.mdp, jnp.asarray(patrol.weights), jnp.asarray(weights).reshape(-1, k))
     shape = (replications * patrollers, n)
     likelihood = _likelihoods(patrol, observability, weights.reshape(-1, k))
     breach = None

@@ -156,11 +156,11 @@ def test_evaluation_maps_over_many_weights() -> None:
     mdp = corridor()
     weights = jnp.array([[1.0, 0.0], [0.0, 1.0], [1.0, 0.9]])
     mapped = jax.vmap(partial(metrics.evaluate, mdp, [1.0, 0.0]))(weights)
+    at_once = metrics.evaluate(mdp, [1.0, 0.0], weights[None])
     for i, one in enumerate(weights):
-        for many, single in zip(
-            jax.tree.leaves(mapped), jax.tree.leaves(metrics.evaluate(mdp, [1.0, 0.0], one)), strict=True
-        ):
-            np.testing.assert_allclose(many[i], single)
+        single = metrics.evaluate(mdp, [1.0, 0.0], one)
+        jax.tree.map(lambda many, one, i=i: np.testing.assert_allclose(many[i], one), mapped, single)
+        jax.tree.map(lambda many, one, i=i: np.testing.assert_allclose(many[0, i], one), at_once, single)
 
 
 def test_log_likelihood_is_that_of_summing_over_all_completions(
