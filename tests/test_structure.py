@@ -90,7 +90,6 @@ OLDER = {
     ("shown", "inference/adversarial/noise_injection.py:NoisyTraining"),
     ("reading", "inference/completion/kalman.py:AffineGaussian"),
     ("readings", "inference/completion/kalman.py:filter_gaussian"),
-    ("readings", "inference/completion/kalman.py:smooth_gaussian"),
     ("report", "inference/journal/journal.py:SessionRecord"),
     ("report", "inference/journal/journal.py:commit"),
     ("decided", "inference/learners/identification.py:SensorIdentification"),

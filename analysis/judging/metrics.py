@@ -101,13 +101,6 @@ def policy_accuracy(mdp: TabularMDP, optimal: Bool[Array, "S A"], policy: Float[
     return Accuracy(jnp.mean(hit), jnp.where(n > 0, share, jnp.nan))
 
 
-def policy_error(
-    mdp: TabularMDP, true_weights: Float[Array, " K"], policy: Float[Array, "S A"]
-) -> LearningError:
-    """Compute the inverse learning error of any policy, under the reward of ``true_weights``."""
-    return _policy_error(mdp, _checked(mdp, true_weights), jnp.asarray(policy))
-
-
 def learned_behavior_accuracy(
     mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
 ) -> Accuracy:
@@ -186,13 +179,6 @@ def inverse_learning_error(
     0.74
     """
     return evaluate(mdp, true_weights, learned_weights).error
-
-
-def learned_value(
-    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
-) -> Float[Array, ""]:
-    """Compute the expected discounted true reward ``p0 . V^pi`` of the learned greedy policy."""
-    return evaluate(mdp, true_weights, learned_weights).value
 
 
 def evaluate(
@@ -285,14 +271,6 @@ def _optimal(mdp: TabularMDP, weights: Float[Array, " K"]) -> Bool[Array, "S A"]
 @jax.jit
 def _greedy(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
     return deterministic_policy(hard_plan(mdp, reward_of(mdp, weights)).optimal)
-
-
-@jax.jit
-def _policy_error(
-    mdp: TabularMDP, true_weights: Float[Array, " K"], policy: Float[Array, "S A"]
-) -> LearningError:
-    reward = reward_of(mdp, true_weights)
-    return _error(hard_plan(mdp, reward).values, policy_values(mdp, policy, reward))
 
 
 @jax.jit

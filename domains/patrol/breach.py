@@ -173,24 +173,6 @@ Watcher = Callable[
 ]
 
 
-def current_beliefs(
-    mdp: TabularMDP,
-    log_policies: Float[Array, "P S A"],
-    sensor: AnySensor,
-    codes: Int[Array, "P L 3"],
-    watcher: Watcher = watch,
-) -> Float[Array, "P S"]:
-    """Compute the belief about each patroller's state after ``L`` observed steps, from ``mdp.initial`` on."""
-
-    def one(log_policy: Float[Array, "S A"], codes: Int[Array, "L 3"]) -> Float[Array, " S"]:
-        def step(belief: Float[Array, " S"], code: Int[Array, " 3"]) -> tuple:
-            return watcher(mdp, log_policy, sensor, belief, code), None
-
-        return lax.scan(step, mdp.initial, codes)[0]
-
-    return jax.vmap(one)(log_policies, jnp.asarray(codes))
-
-
 Detection = Callable[[Array, Float[Array, "P S"]], Float[Array, "T C"]]
 """Probabilities of detection in each cell at each step to come, from a key and the beliefs."""
 
@@ -328,7 +310,8 @@ def plan_breach(task: BreachTask, detection: Float[Array, "T C *n"], settings: B
         return values, (values, moves)
 
     last = jnp.zeros((len(task.goal), *detection.shape[2:]))
-    values, moves = lax.scan(back, last, detection[:-1], reverse=True)[1]
+    swept: tuple = lax.scan(back, last, detection[:-1], reverse=True)[1]
+    values, moves = swept
     return BreachPlan(
         jnp.concatenate([values, last[None]]), jnp.concatenate([moves, jnp.zeros_like(moves[:1])])
     )

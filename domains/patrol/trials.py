@@ -355,7 +355,7 @@ def _trials(
             values = plan(now, beliefs).values[:, task.start].T
             left = deadline - now
             allowed = jnp.where(jnp.arange(horizon) <= left[:, None], values, -jnp.inf)
-            return jax.vmap(go)(go_key, now - ready, left, allowed)
+            return jax.vmap(go.__call__)(go_key, now - ready, left, allowed)
 
         def waiting(now: Int[Array, " n"], settled: Bool[Array, " n"]) -> Bool[Array, " n"]:
             return (now <= deadline) & ~settled
@@ -436,9 +436,3 @@ def soft_policies(patrol: Patrol, weights: Float[np.ndarray, "P K"]) -> Float[Ar
 @jax.jit
 def _soft(mdp: TabularMDP, weights: Float[Array, "P K"]) -> Float[Array, "P S A"]:
     return jax.vmap(lambda w: soft_plan(mdp, reward_of(mdp, w)).log_policy)(weights)
-
-
-def random_policies(key: Array, patrol: Patrol) -> Float[Array, "P S A"]:
-    """Draw the dissertation's random baseline: greedy policies under weights uniform on (-0.99, 0.99)."""
-    shape = (patrol.patrollers, patrol.mdp.n_features)
-    return greedy_policies(patrol, np.asarray(jax.random.uniform(key, shape, float, -0.99, 0.99)))

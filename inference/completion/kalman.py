@@ -166,13 +166,6 @@ def smooth_filtered(filtered: GaussianFiltered) -> GaussianSmoothed:
     )
 
 
-def smooth_gaussian(
-    chain: AffineGaussian, readings: Float[Array, "L m"], read: Bool[Array, " L"]
-) -> GaussianSmoothed:
-    """Run both passes; ``read`` as for :func:`filter_gaussian`."""
-    return smooth_filtered(filter_gaussian(chain, readings, read))
-
-
 def sample_filtered(key: Array, filtered: GaussianFiltered, draws: int) -> Float[Array, "draws L D"]:
     """Draw whole chains independently given all observations, backwards from the last state."""
     length, size = filtered.means.shape

@@ -197,25 +197,6 @@ def gibbs_posterior(
     return _average(mdp, log_policy, evidence, states, actions)
 
 
-def blocked_expectations(
-    key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, draws: int
-) -> Expectations:
-    """Estimate :func:`expectations` from ``draws`` independent joint completions."""
-    return collect(mdp, blocked_posterior(key, mdp, log_policy, evidence, draws), evidence.live)
-
-
-def gibbs_expectations(
-    key: Array,
-    mdp: TabularMDP,
-    log_policy: Float[Array, "S A"],
-    evidence: Evidence,
-    draws: int,
-    burn_in: int = 20,
-) -> Expectations:
-    """Estimate :func:`expectations` from ``draws`` of the single-site Gibbs sampler."""
-    return collect(mdp, gibbs_posterior(key, mdp, log_policy, evidence, draws, burn_in), evidence.live)
-
-
 class _SingleSite(NamedTuple):
     """Single-site sampler of one trajectory: an initial pair ``(states, actions)``, and one iteration."""
 

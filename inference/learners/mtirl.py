@@ -354,18 +354,6 @@ def batch_mme_mtirl(
     return BatchMixture("MME-MTIRL", fit)
 
 
-def clustering_of(state: MixtureState, info: MixtureInfo) -> Clustering:
-    """Return the components of an online learner, largest first, with its last session's assignments."""
-    proportions = np.asarray(state.proportions)
-    order = np.argsort(-proportions, kind="stable")[: np.count_nonzero(proportions)]
-    return Clustering(
-        np.asarray(state.weights)[order],
-        proportions[order],
-        np.asarray(info.responsibilities)[:, order],
-        float(info.log_likelihood) * float(np.sum(state.mass)),
-    )
-
-
 def assign_trajectories(
     mdp: TabularMDP,
     sensor: AnySensor | None,

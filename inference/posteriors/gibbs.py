@@ -23,6 +23,7 @@ from jaxtyping import Array, Float, Int
 
 from ...models.inputs.arguments import as_key
 from ...models.inputs.display import shown_briefly
+from ...models.inputs.text import counted
 from ...models.laws.mixture import (
     COMPONENTS,
     component_log_likelihoods,
@@ -34,6 +35,7 @@ from ...models.laws.occlusion import ScaledPrior
 from ...models.observation.demonstration import Demonstration
 from ...models.observation.evidence import AnySensor
 from ...models.process.mdp import TabularMDP
+from ..sessions.progress import progress_line
 from .mixture_problem import MixtureProblem, Start, in_threads, mixture_data, pose, resolve_jit, starts
 
 _CONCENTRATION_MOVES = 5
@@ -381,6 +383,7 @@ def gibbs_mixture_posterior(
     components: int = COMPONENTS,
     concentration: float | dist.Distribution = 1.0,
     prior: dist.Distribution | None = None,
+    progress: bool = False,
     **sampling: Unpack[GibbsSamplingOptions],
 ) -> az.InferenceData:
     """Draw from the posterior of the Dirichlet process that :func:`mixture_model` truncates.
@@ -404,6 +407,8 @@ def gibbs_mixture_posterior(
         New components offered to a trajectory, Neal's ``m``; 3 by default.
     moves : int
         Slice moves of each component's weights in an iteration; 4 by default.
+    progress : bool
+        Print each step that begins on standard error.
 
     Returns
     -------
@@ -452,20 +457,28 @@ def gibbs_mixture_posterior(
         warmup=warmup,
     )
     start_key, chain_key, break_key, resolve_key = jax.random.split(key, 4)
-    reference = reference_gaussian(problem.prior)
-    run = partial(_run_chain, sweeps=Sweeps(warmup, draws, auxiliary, moves, thin))
-    begins = [_seat(problem, start) for start in starts(start_key, problem, chains, len(problem.rows))]
-    keys = jax.random.split(chain_key, chains)
-    seated: Seated = in_threads(run, [(k, problem, reference, s) for k, s in zip(keys, begins, strict=True)])
-    n_draws = chains * draws
-    flat = jax.tree.map(lambda x: jnp.asarray(x.reshape(n_draws, *x.shape[2:])), seated)
-    most = max(len(np.unique(row)) for row in np.asarray(flat.assignment))
-    components = max(components, most + 1)
-    weights, proportions, assignment = _break_all(
-        jax.random.split(break_key, n_draws), flat, problem.prior, components
-    )
-    keys = jax.random.split(resolve_key, n_draws)
-    resolved = resolve_jit(keys, weights, proportions, flat.concentration, problem, assignment)
+    with progress_line(progress) as tell:
+        tell("posterior: finding starts, compiling first")
+        reference = reference_gaussian(problem.prior)
+        run = partial(_run_chain, sweeps=Sweeps(warmup, draws, auxiliary, moves, thin))
+        begins = [_seat(problem, start) for start in starts(start_key, problem, chains, len(problem.rows))]
+        tell(
+            f"posterior: {counted(chains, 'chain')} of {warmup} + {draws * thin} iterations, compiling first"
+        )
+        keys = jax.random.split(chain_key, chains)
+        seated: Seated = in_threads(
+            run, [(k, problem, reference, s) for k, s in zip(keys, begins, strict=True)]
+        )
+        n_draws = chains * draws
+        flat = jax.tree.map(lambda x: jnp.asarray(x.reshape(n_draws, *x.shape[2:])), seated)
+        most = max(len(np.unique(row)) for row in np.asarray(flat.assignment))
+        components = max(components, most + 1)
+        weights, proportions, assignment = _break_all(
+            jax.random.split(break_key, n_draws), flat, problem.prior, components
+        )
+        tell("posterior: likelihoods of the draws")
+        keys = jax.random.split(resolve_key, n_draws)
+        resolved = resolve_jit(keys, weights, proportions, flat.concentration, problem, assignment)
     shape = (chains, draws)
     drawn = tuple(
         np.asarray(x).reshape(*shape, *x.shape[1:]) for x in (weights, proportions, flat.concentration)

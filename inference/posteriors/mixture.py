@@ -21,10 +21,12 @@ from numpyro.infer import NUTS
 
 from ...models.inputs.arguments import as_key
 from ...models.inputs.display import shown_briefly
+from ...models.inputs.text import counted
 from ...models.laws.mixture import COMPONENTS, stick_proportions
 from ...models.observation.demonstration import Demonstration
 from ...models.observation.evidence import AnySensor
 from ...models.process.mdp import TabularMDP
+from ..sessions.progress import progress_line
 from .chains import Sampling, SamplingOptions, Transitions, in_threads, run_nuts
 from .mixture_problem import (
     MixtureProblem,
@@ -120,6 +122,7 @@ def sample_mixture_posterior(
     components: int = COMPONENTS,
     concentration: float | dist.Distribution = 1.0,
     prior: dist.Distribution | None = None,
+    progress: bool = False,
     **sampling: Unpack[SamplingOptions],
 ) -> az.InferenceData:
     """Draw from the posterior of :func:`mixture_model` by NUTS, then assignments given each draw.
@@ -149,6 +152,8 @@ def sample_mixture_posterior(
         Draws returned and discarded by each chain, and number of chains; 500, 500 and 4 by default.
     target_accept, max_tree_depth
         As in NumPyro's ``NUTS``; 0.9 and 8 by default.
+    progress : bool
+        Print each step that begins on standard error.
 
     Returns
     -------
@@ -202,19 +207,25 @@ def sample_mixture_posterior(
         warmup=warmup,
     )
     start_key, fill_key, chain_key, assign_key = jax.random.split(key, 4)
-    run = partial(
-        _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
-    )
-    begins = [
-        _start_position(k, start, problem, components)
-        for k, start in zip(
-            jax.random.split(fill_key, chains), starts(start_key, problem, chains, components), strict=True
+    with progress_line(progress) as tell:
+        tell("posterior: finding starts, compiling first")
+        run = partial(
+            _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
         )
-    ]
-    keys = jax.random.split(chain_key, chains)
-    chain: MixtureChain = in_threads(run, [(k, problem, z) for k, z in zip(keys, begins, strict=True)])
-    flat = [jnp.asarray(x.reshape(chains * draws, *x.shape[2:])) for x in chain[:3]]
-    resolved = resolve_jit(jax.random.split(assign_key, chains * draws), *flat, problem)
+        begins = [
+            _start_position(k, start, problem, components)
+            for k, start in zip(
+                jax.random.split(fill_key, chains),
+                starts(start_key, problem, chains, components),
+                strict=True,
+            )
+        ]
+        tell(f"posterior: {counted(chains, 'chain')} of {warmup} + {draws} draws, compiling first")
+        keys = jax.random.split(chain_key, chains)
+        chain: MixtureChain = in_threads(run, [(k, problem, z) for k, z in zip(keys, begins, strict=True)])
+        tell("posterior: assignments of the draws")
+        flat = [jnp.asarray(x.reshape(chains * draws, *x.shape[2:])) for x in chain[:3]]
+        resolved = resolve_jit(jax.random.split(assign_key, chains * draws), *flat, problem)
     n_steps = chain.transitions.n_steps
     depth = np.floor(np.log2(np.maximum(n_steps, 1))).astype(int) + 1
     stats = {

@@ -22,6 +22,7 @@ from numpyro.infer.util import potential_energy
 
 from ...models.inputs.arguments import as_key
 from ...models.inputs.display import shown_briefly
+from ...models.inputs.text import counted
 from ...models.laws.noisy_behaviour import noisy_behaviour_model, reliabilities_prior
 from ...models.laws.trajectory import TrajectoryLaw
 from ...models.observation.demonstration import Demonstration
@@ -35,6 +36,7 @@ from ...models.observation.evidence import (
 from ...models.process.mdp import TabularMDP
 from ...models.process.planning import require_discounted
 from ...version import __version__
+from ..sessions.progress import progress_line
 from .chains import Mode, Sampling, SamplingOptions, Transitions, in_threads, mode_of, run_nuts
 from .weights import described_prior, fingerprint, gather
 
@@ -229,9 +231,10 @@ def noisy_problem(
 
 
 class NoisySamplingOptions(SamplingOptions, total=False):
-    """Options of the sampler, and the names of the predicates."""
+    """Options of the sampler, names of the predicates, and whether to print each step."""
 
     names: tuple[str, ...] | None
+    progress: bool
 
 
 def sample_noisy_posterior(
@@ -265,6 +268,8 @@ def sample_noisy_posterior(
         Draws returned and discarded by each chain, and number of chains; 500, 300 and 4 by default.
     target_accept, max_tree_depth
         As in NumPyro's ``NUTS``; 0.9 and 10 by default.
+    progress : bool
+        Print each step that begins on standard error.
 
     Returns
     -------
@@ -301,7 +306,7 @@ def sample_noisy_posterior(
     >>> dict(data.posterior["reliabilities"].sizes)
     {'chain': 1, 'draw': 20, 'predicate': 2}
     """
-    names = sampling.pop("names", None)
+    names, progress = sampling.pop("names", None), sampling.pop("progress", False)
     draws, warmup, chains, target_accept, max_tree_depth = Sampling().but(sampling).checked()
     problem, rows = noisy_problem(
         mdp,
@@ -318,12 +323,17 @@ def sample_noisy_posterior(
         raise ValueError(f"there is one name for each of {n_predicates} predicates, got {list(names)}")
     key = as_key(key)
     start_key, chain_key = jax.random.split(key)
-    starts = noisy_starts(start_key, problem, chains)
-    run = partial(
-        _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
-    )
-    keys = jax.random.split(chain_key, chains)
-    chain: NoisyChain = in_threads(run, [(k, problem, *start) for k, start in zip(keys, starts, strict=True)])
+    with progress_line(progress) as tell:
+        tell("posterior: finding modes, compiling first")
+        starts = noisy_starts(start_key, problem, chains)
+        tell(f"posterior: {counted(chains, 'chain')} of {warmup} + {draws} draws, compiling first")
+        run = partial(
+            _run_chain, warmup=warmup, draws=draws, target_accept=target_accept, max_tree_depth=max_tree_depth
+        )
+        keys = jax.random.split(chain_key, chains)
+        chain: NoisyChain = in_threads(
+            run, [(k, problem, *start) for k, start in zip(keys, starts, strict=True)]
+        )
     flat = (jnp.asarray(x.reshape(chains * draws, -1)) for x in (chain.weights, chain.reliabilities))
     log_likelihood = np.asarray(noisy_log_likelihood(*flat, problem))[:, rows].reshape(chains, draws, -1)
     steps = ["trajectory", "step"]

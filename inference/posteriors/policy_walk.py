@@ -19,6 +19,7 @@ from jaxtyping import Array, Bool, Float
 
 from ...models.inputs.arguments import as_key
 from ...models.inputs.display import shown_briefly
+from ...models.inputs.text import counted
 from ...models.laws.occlusion import weights_prior
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
@@ -35,6 +36,7 @@ from ..learners.boltzmann import (
     require_positive,
     visit_counts,
 )
+from ..sessions.progress import progress_line
 from .weights import described_prior
 
 # Target acceptance of the step: best for a random walk in several dimensions (Roberts et al. 1997).
@@ -157,6 +159,7 @@ def birl(
     *,
     rationality: float = ETA,
     prior: dist.Distribution | None = None,
+    progress: bool = False,
     **sampling: Unpack[WalkingOptions],
 ) -> az.InferenceData:
     """Draw from the posterior over weights of one Boltzmann expert.
@@ -179,6 +182,8 @@ def birl(
     step : float
         Initial width of the random walk of scaled weights (0.1 by default); tuned during the warm-up and then
         fixed.
+    progress : bool
+        Print each step that begins on standard error.
 
     Returns
     -------
@@ -219,18 +224,20 @@ def birl(
         raise ValueError(f"warmup must be at least 0, got {warmup}")
     counts = visit_counts(mdp, demonstration)
     prior = None if prior is None else weights_prior(mdp.n_features, prior)
-    walk: Walk = jax.tree.map(
-        np.asarray,
-        _walk(
-            as_key(key),
-            with_scaled_features(mdp),
-            jnp.asarray(counts),
-            prior,
-            jnp.asarray(float(rationality)),
-            jnp.asarray(float(step)),
-            _Lengths(chains, warmup, draws),
-        ),
-    )
+    with progress_line(progress) as tell:
+        tell(f"posterior: {counted(chains, 'chain')} of {warmup} + {draws} draws, compiling first")
+        walk: Walk = jax.tree.map(
+            np.asarray,
+            _walk(
+                as_key(key),
+                with_scaled_features(mdp),
+                jnp.asarray(counts),
+                prior,
+                jnp.asarray(float(rationality)),
+                jnp.asarray(float(step)),
+                _Lengths(chains, warmup, draws),
+            ),
+        )
     if prior is not None and not np.isfinite(walk.lp[:, -1]).all():
         raise ValueError(f"the prior {described_prior(prior)} gives no probability to weights in [-1, 1]")
     attrs = {

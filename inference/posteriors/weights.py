@@ -26,6 +26,7 @@ from numpyro.infer.util import potential_energy
 
 from ...models.inputs.arguments import as_key
 from ...models.inputs.display import shown_briefly
+from ...models.inputs.text import counted
 from ...models.laws.chain import filter_all, sample_backward
 from ...models.laws.occlusion import ScaledPrior, occlusion_model, scaled_prior
 from ...models.observation.demonstration import PAD, UNKNOWN, Demonstration
@@ -354,7 +355,7 @@ def _sampled(
     draws, warmup, chains, _, max_tree_depth = sampling
     tell("posterior: finding the mode, compiling first")
     mode = posterior_mode(problem)
-    tell(f"posterior: {chains} chains of {warmup} + {draws} draws, compiling first")
+    tell(f"posterior: {counted(chains, 'chain')} of {warmup} + {draws} draws, compiling first")
     start_key, chain_key, completion_key = jax.random.split(key, 3)
     chain = run_chains(chain_jobs(start_key, chain_key, problem, mode, sampling), sampling)
     tell("posterior: log-likelihoods of the draws")

@@ -195,7 +195,7 @@ def patrol_study(
     learners = {
         ONLINE: partial(_online, lme_i2rl(patrol.mdp, view)),
         FORGETFUL: partial(_online, lme_i2rl_with_random_weights(patrol.mdp, view)),
-        BATCH: partial(_batch, batch_lme(patrol.mdp, view)),
+        BATCH: partial(_batch, batch_lme(patrol.mdp, view), set()),
         RANDOM: partial(_random, patrol),
         TRUE: partial(_true, patrol),
     }
@@ -262,7 +262,9 @@ def _online(learner: Learner, key: jax.Array, demonstrations: Sequence[Demonstra
     return _Learned(np.arange(1, weights.shape[1] + 1), weights, seconds)
 
 
-def _batch(batch: Any, key: jax.Array, demonstrations: Sequence[Demonstration]) -> _Learned:
+def _batch(
+    batch: Any, compiled: set[tuple[int, ...]], key: jax.Array, demonstrations: Sequence[Demonstration]
+) -> _Learned:
     import time
 
     n = demonstrations[0].n_trajectories
@@ -270,7 +272,9 @@ def _batch(batch: Any, key: jax.Array, demonstrations: Sequence[Demonstration]) 
     weights, seconds = [], []
     for count in points:
         part = [d.select(slice(0, int(count))) for d in demonstrations]
-        batch.fit(key, part[0])  # compiled for this size before the clock starts
+        if (size := part[0].bucketed().kind.shape) not in compiled:  # before the clock starts
+            batch.fit(key, part[0])
+            compiled.add(size)
         began = time.perf_counter()
         fits = [batch.fit(key, d) for d in part]
         seconds.append(time.perf_counter() - began)

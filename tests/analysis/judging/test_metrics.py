@@ -127,10 +127,8 @@ def test_error_agrees_with_summing_rewards_along_the_chain(random_mdp, dense_tra
     assert loss > 0
     result = metrics.inverse_learning_error(mdp, truth, learned)
     assert float(result.absolute) == pytest.approx(loss, rel=1e-9)
-    assert float(metrics.policy_error(mdp, truth, policy).absolute) == pytest.approx(loss, rel=1e-9)
-    assert float(metrics.learned_value(mdp, truth, learned)) == pytest.approx(
-        np.asarray(mdp.initial) @ values
-    )
+    value = metrics.evaluate(mdp, truth, learned).value
+    assert float(value) == pytest.approx(np.asarray(mdp.initial) @ values)
 
 
 def test_relative_error_is_undefined_without_reward() -> None:

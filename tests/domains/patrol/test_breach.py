@@ -16,7 +16,6 @@ from i2rl.domains.patrol.breach import (
     IndependentForecast,
     SimulatedForecast,
     breach_task,
-    current_beliefs,
     detection_probability,
     line_of_sight,
     plan_breach,
@@ -47,7 +46,6 @@ from i2rl.domains.patrol.trials import (
     Watching,
     breach_trials,
     greedy_policies,
-    random_policies,
     soft_policies,
 )
 from i2rl.models import reward_of, soft_plan
@@ -134,6 +132,23 @@ def test_watching_step_by_step_is_the_forward_filter(glimpses):
         assert np.allclose(belief, exact, atol=1e-12)
 
 
+def current_beliefs(mdp, log_policies, sensor, codes, watcher=watch):
+    """Follow the belief about each patroller over the observed steps, from the initial distribution on."""
+
+    @jax.jit
+    def one(log_policy, codes):
+        step = lambda belief, code: (watcher(mdp, log_policy, sensor, belief, code), None)  # noqa: E731
+        return jax.lax.scan(step, mdp.initial, codes)[0]
+
+    return jnp.stack([one(*each) for each in zip(log_policies, jnp.asarray(codes), strict=True)])
+
+
+def random_policies(seed):
+    """Greedy policies under weights uniform on (-0.99, 0.99), the dissertation's random baseline."""
+    shape = (PATROL.patrollers, PATROL.mdp.n_features)
+    return greedy_policies(PATROL, np.random.default_rng(seed).uniform(-0.99, 0.99, shape))
+
+
 def after(codes, watcher=watch, policies=TRUE):
     return np.asarray(current_beliefs(PATROL.mdp, policies[:1], PATROL.visibility(30), codes[None], watcher))[
         0
@@ -186,7 +201,7 @@ def test_perception_overrules_a_policy_that_excludes_it():
 @pytest.mark.parametrize("watcher", [watch, project])
 def test_beliefs_are_distributions(watcher, glimpses):
     codes = jnp.stack([d.codes[0] for d in glimpses])
-    policies = random_policies(jax.random.key(2), PATROL)
+    policies = random_policies(2)
     beliefs = current_beliefs(PATROL.mdp, policies, PATROL.visibility(30), codes, watcher)
     assert np.allclose(beliefs.sum(1), 1)
     assert (beliefs >= 0).all()
@@ -437,7 +452,7 @@ def test_leaving_at_random_times_out_half_of_the_time():
 
 def test_knowing_the_patrollers_beats_guessing():
     known_policy = breach_trials(jax.random.key(4), PATROL, TRUE, **COMMON)
-    guessed = breach_trials(jax.random.key(4), PATROL, random_policies(jax.random.key(4), PATROL), **COMMON)
+    guessed = breach_trials(jax.random.key(4), PATROL, random_policies(4), **COMMON)
     assert known_policy.interval()[0] > guessed.interval()[1]
 
 

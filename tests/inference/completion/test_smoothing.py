@@ -16,10 +16,11 @@ from hypothesis import strategies as st
 from i2rl.inference.completion import smoothing
 from i2rl.inference.completion.smoothing import (
     Evidence,
-    blocked_expectations,
+    blocked_posterior,
+    collect,
     expectations,
     gibbs_completions,
-    gibbs_expectations,
+    gibbs_posterior,
     log_likelihoods,
     sample_completions,
     settled_completions,
@@ -167,9 +168,8 @@ def test_blocked_estimates_lie_within_four_standard_errors(
     demonstration = imperfect_demonstration(6, mdp, log_policy, sensor, N, LENGTH)
     evidence = evidence_of(mdp, sensor, demonstration)
     truth = exact(mdp, log_policy, evidence)
-    estimate = jax.jit(blocked_expectations, static_argnums=4)(
-        jax.random.key(1), mdp, log_policy, evidence, draws
-    )
+    drawn = jax.jit(blocked_posterior, static_argnums=4)(jax.random.key(1), mdp, log_policy, evidence, draws)
+    estimate = collect(mdp, drawn, evidence.live)
     features, powers = np.asarray(mdp.features), float(mdp.discount) ** np.arange(LENGTH)
     variance = np.zeros(2)
     count_variance = np.zeros((S, A))
@@ -200,7 +200,8 @@ def test_gibbs_estimates_lie_within_four_standard_errors_where_every_move_is_pos
     evidence = evidence_of(mdp, sensor, demonstration)
     truth = exact(mdp, log_policy, evidence)
     key = jax.random.key(2)
-    estimate = jax.jit(gibbs_expectations, static_argnums=(4, 5))(key, mdp, log_policy, evidence, draws, 200)
+    drawn = jax.jit(gibbs_posterior, static_argnums=(4, 5))(key, mdp, log_policy, evidence, draws, 200)
+    estimate = collect(mdp, drawn, evidence.live)
     states, actions = gibbs(key, mdp, log_policy, evidence, draws, 200)
     live = np.asarray(evidence.live)
     assert (np.asarray(states)[:, ~live] == UNKNOWN).all()

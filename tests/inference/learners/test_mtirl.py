@@ -12,7 +12,7 @@ from i2rl.analysis.judging.multi_task import assignment_accuracy, expected_value
 from i2rl.domains.sorting.process import demonstrate_sorting, sorting_with_claiming
 from i2rl.inference import batch_mme_mtirl, mme_mtirl, run_sessions, run_streams
 from i2rl.inference.journal.journal import Journal
-from i2rl.inference.learners.mtirl import assign_trajectories, clustering_of
+from i2rl.inference.learners.mtirl import assign_trajectories
 from i2rl.models import (
     Demonstration,
     DemonstrationError,
@@ -116,11 +116,12 @@ def test_online_finds_what_batch_finds_and_a_way_that_comes_late(sorting, online
         n_components.append(info.n_components)
     assert n_components[5] == 2
     assert n_components[-1] == 3
-    found = clustering_of(state, info)
-    shares = assign_trajectories(sorting.mdp, None, found.weights, found.proportions, demonstration)
+    found = np.flatnonzero(state.proportions)
+    weights, proportions = np.asarray(state.weights)[found], np.asarray(state.proportions)[found]
+    shares = assign_trajectories(sorting.mdp, None, weights, proportions, demonstration)
     assert assignment_accuracy(labels, shares.argmax(1)) == 1
     loss = expected_value_difference(
-        sorting.mdp, sorting.weights, labels, found.weights, shares.argmax(1), demonstration
+        sorting.mdp, sorting.weights, labels, weights, shares.argmax(1), demonstration
     )
     assert loss == 0
     # The state holds only these sums of old trajectories (Eq. 5.7 and 5.8).
