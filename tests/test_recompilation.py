@@ -1,3 +1,5 @@
+from dataclasses import replace
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -5,7 +7,7 @@ import numpyro.distributions as dist
 import pytest
 from jax import monitoring
 
-from i2rl.inference import batch_mme_mtirl, sample_posterior
+from i2rl.inference import Harmonic, batch_lme, batch_mme_mtirl, lme_i2rl, sample_posterior
 from i2rl.models import (
     Visibility,
     feature_expectations,
@@ -96,3 +98,41 @@ def test_mixtures_with_other_options_compile_nothing(random_mdp, imperfect_demon
     }
     other = batch_mme_mtirl(mdp, sensor, n_components=2, **options)
     assert compilations(lambda: other.fit(jax.random.key(1), second).weights) == 0
+
+
+def test_learners_that_differ_in_numbers_share_a_program(random_mdp, imperfect_demonstration):
+    mdp, other = random_mdp(0), replace(random_mdp(0), features=random_mdp(1).features)
+    view = Visibility(np.array([True, True, False, True]))
+    log_policy = soft_plan(mdp, reward_of(mdp, jnp.array([1.0, -1.0]))).log_policy
+    demonstration = imperfect_demonstration(0, mdp, log_policy, view, 6, 5)
+    key, half = jax.random.key(0), Visibility(np.array([1.0, 0.5, 0.5, 1.0]))
+
+    def online(mdp, view, **options):
+        learner = lme_i2rl(mdp, view, **options)
+        return learner.update(learner.init(key), demonstration)[0].weights
+
+    first = online(mdp, view)
+    assert compilations(lambda: online(other, half, slack=0.1, ridge=2.0, iterations=3, tolerance=0.1)) == 0
+    assert not np.allclose(first, online(mdp, view, slack=0.1))
+    online(mdp, view, slack=Harmonic(0.1))
+    assert compilations(lambda: online(mdp, view, slack=Harmonic(0.3))) == 0
+    by_schedule = [online(mdp, view, slack=lambda n, c=c: c + 0 * n) for c in (0.01, 0.1)]
+    np.testing.assert_allclose(by_schedule, [online(mdp, view, slack=c) for c in (0.01, 0.1)], rtol=1e-9)
+
+    def batch(mdp, view, **options):
+        return batch_lme(mdp, view, restarts=1, **options).fit(key, demonstration).weights
+
+    batch(mdp, view)
+    assert compilations(lambda: batch(other, half, slack=0.1, ridge=2.0, iterations=3)) == 0
+
+
+def test_a_sensor_of_another_library_is_part_of_the_program(random_mdp, imperfect_demonstration):
+    class Theirs:
+        visibility, noise = np.array([1.0, 1.0, 0.0, 1.0]), None
+
+    mdp = random_mdp(0)
+    log_policy = soft_plan(mdp, reward_of(mdp, jnp.array([1.0, -1.0]))).log_policy
+    demonstration = imperfect_demonstration(0, mdp, log_policy, Visibility(Theirs.visibility), 6, 5)
+    learners = [lme_i2rl(mdp, sensor) for sensor in (Theirs(), Visibility(Theirs.visibility))]
+    theirs, ours = (x.update(x.init(jax.random.key(0)), demonstration)[0].weights for x in learners)
+    np.testing.assert_allclose(theirs, ours, rtol=1e-12)

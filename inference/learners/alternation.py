@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from functools import partial
+from dataclasses import dataclass, field
 from typing import Any, NamedTuple, TypedDict
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from ...models.inputs.display import shown_briefly
 from ...models.laws.chain import Smoothed
 from ...models.observation.evidence import (
     AnySensor,
@@ -28,7 +28,7 @@ from ..programs.maximum_entropy import (
     fit_scaled_counts,
     solve_scaled_dual,
 )
-from ..sessions.schedule import Schedule, program_slack, require_slack
+from ..sessions.schedule import Harmonic, Schedule, program_slack, require_slack
 from ..sessions.statistic import STATISTICS, FeatureStatistic, Statistic, blend, complete
 
 # Lemma 2 with eps_s = 0.05 and delta_s = 0.1 for six features (section 7.4.1).
@@ -51,16 +51,44 @@ class AlternationOptions(TypedDict, total=False):
     draws: int
 
 
-@shown_briefly
-class Method(NamedTuple):
-    """Choices that all parts of a session share."""
+@dataclass(frozen=True)
+class Completion:
+    """An E-step, exact or estimated from ``draws``."""
+
+    name: str
+    draws: int
+
+    def posterior(
+        self, key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence
+    ) -> Smoothed:
+        """Complete trajectories under a policy."""
+        if self.name == "exact":
+            return smooth_all(mdp, log_policy, evidence)
+        return _SAMPLERS[self.name](key, mdp, log_policy, evidence, draws=self.draws)
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True)
+class Method:
+    """Choices that all parts of a session share, an argument of compiled programs.
+
+    Process, sensor, slack and ridge are data: learners that differ in their numbers alone share a program.
+    Other schedules than :class:`~i2rl.inference.sessions.schedule.Harmonic`, and sensors that are not
+    pytrees of arrays, are part of the program (``jax.tree_util.Partial``).
+    """
 
     mdp: TabularMDP
-    sensor: AnySensor
-    statistic: Statistic
-    completion: Callable[[Array, TabularMDP, Float[Array, "S A"], Evidence], Smoothed]
-    slack: Schedule
-    ridge: float
+    given_sensor: Any
+    statistic: Statistic = field(metadata={"static": True})
+    completion: Completion = field(metadata={"static": True})
+    slack: Any
+    ridge: Any
+
+    @property
+    def sensor(self) -> AnySensor:
+        """The sensor as it was given."""
+        given = self.given_sensor
+        return given() if isinstance(given, jax.tree_util.Partial) else given
 
     def plan(self, weights: Float[Array, " K"], values: Float[Array, " S"]) -> SoftPlan:
         """Plan softly under weights, from earlier values."""
@@ -68,7 +96,7 @@ class Method(NamedTuple):
 
     def e_step(self, key: Array, plan: SoftPlan, evidence: Evidence, seen: Bool[Array, "n L"]) -> Any:
         """Complete a session's trajectories under a plan."""
-        posterior = self.completion(key, self.mdp, plan.log_policy, evidence)
+        posterior = self.completion.posterior(key, self.mdp, plan.log_policy, evidence)
         return complete(self.mdp, posterior, evidence.live, seen)
 
     def working(self, kept: Any, key: Array, plan: SoftPlan, evidence: Evidence, seen: Array) -> tuple:
@@ -99,6 +127,17 @@ class Method(NamedTuple):
         return slack, self.ridge / jnp.maximum(statistic.size, 1.0)
 
 
+_SAMPLERS: dict[str, Callable[..., Smoothed]] = {"blocked": blocked_posterior, "gibbs": gibbs_posterior}
+
+
+def _as_data(given: Any) -> Any:
+    """Return a pytree whose leaves are arrays; for any other object a static function that returns it."""
+    plain = int | float | np.ndarray | jax.Array
+    if all(isinstance(leaf, plain) for leaf in jax.tree.leaves(given)):
+        return jax.tree.map(jnp.asarray, given)
+    return jax.tree_util.Partial(lambda: given)
+
+
 def checked_method(
     mdp: TabularMDP,
     sensor: AnySensor,
@@ -109,10 +148,9 @@ def checked_method(
     draws: int,
 ) -> Method:
     """Check the choices of a method, and gather them."""
-    samplers = {"blocked": blocked_posterior, "gibbs": gibbs_posterior}
     if statistic not in STATISTICS:
         raise ValueError(f"statistic must be one of {', '.join(STATISTICS)}, got {statistic!r}")
-    if completion != "exact" and completion not in samplers:
+    if completion != "exact" and completion not in _SAMPLERS:
         raise ValueError(f"completion must be exact, blocked or gibbs, got {completion!r}")
     if completion != "exact" and draws < 1:
         raise ValueError(f"a sampled completion needs at least one draw, got {draws}")
@@ -120,12 +158,16 @@ def checked_method(
     if not ridge >= 0:
         raise ValueError(f"ridge must not be negative, got {ridge}")
 
-    def exact(key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Smoothed:
-        del key
-        return smooth_all(mdp, log_policy, evidence)
-
-    complete_with = exact if completion == "exact" else partial(samplers[completion], draws=draws)
-    return Method(mdp, sensor, STATISTICS[statistic], complete_with, slack, ridge)
+    if callable(slack) and not isinstance(slack, Harmonic):
+        slack = jax.tree_util.Partial(lambda session, schedule=slack: schedule(session))
+    return Method(
+        mdp,
+        _as_data(sensor),
+        STATISTICS[statistic],
+        Completion(completion, draws if completion != "exact" else 0),
+        slack,
+        ridge,
+    )
 
 
 def random_weights(key: Array, mdp: TabularMDP) -> Float[Array, " K"]:

@@ -183,8 +183,7 @@ def lme_i2rl(
             "tolerance": tolerance,
             "sensor": digest_of(sensor),
         }
-        start = partial(_carried_on, method)
-        return _learner(name, method, start, solver, steps, configuration)
+        return _learner(name, method, _carried_on, solver, steps, configuration)
 
     return on_scaled_features(mdp, build)
 
@@ -208,11 +207,10 @@ def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: AnySensor, **options: 
             configuration["ridge"],
             configuration["draws"],
         )
-        start = partial(_started_afresh, method)
         return _learner(
             carried.name,
             method,
-            start,
+            _started_afresh,
             configuration["solver"],
             Alternation(configuration["iterations"], configuration["tolerance"]),
             configuration,
@@ -358,18 +356,101 @@ def _close(
     return state, SessionInfo(**fields)
 
 
+_IN_JAX = {"newton": newton, "exponentiated gradient": exponentiated}
+Start = Callable[[Method, Array, LMEState], tuple]
+
+
+def _begin(start: Start, method: Method, state: LMEState, demonstration: Demonstration) -> tuple:
+    evidence = evidence_of(method.mdp, method.sensor, demonstration)
+    seen = jnp.asarray(demonstration.kind) == SEEN_STEP
+    key, fresh = jax.random.split(state.key)
+    return evidence, seen, key, *start(method, fresh, state)
+
+
+def _session(
+    solver: str,
+    start: Start,
+    method: Method,
+    alternation: Alternation,
+    state: LMEState,
+    demonstration: Demonstration,
+) -> tuple[LMEState, SessionInfo]:
+    """Learn from a session with a solver in JAX."""
+    evidence, seen, key, weights, values = _begin(start, method, state, demonstration)
+    ending = _em(
+        method,
+        _IN_JAX[solver],
+        alternation,
+        _Session(state.session + 1, state.statistic, evidence, seen),
+        key,
+        weights,
+        values,
+    )
+    return _close(method, state, ending.point, state.program, ending.plan, ending.completed)
+
+
+# Compiled once for all learners: the method's numbers are arguments.
+_begun = jax.jit(_begin, static_argnums=0)
+_learned = jax.jit(_session, static_argnums=(0, 1))
+
+
+@jax.jit
+def _expected(
+    method: Method,
+    state: LMEState,
+    key: Array,
+    weights: Float[Array, " K"],
+    values: Float[Array, " S"],
+    evidence: Evidence,
+    seen: Bool[Array, "n L"],
+) -> tuple:
+    key, sample = jax.random.split(key)
+    plan = method.plan(weights, values)
+    working, own = method.working(state.statistic, sample, plan, evidence, seen)
+    gradient = method.gradient(plan, working)
+    return key, plan.values, own, gradient, working, *method.penalties(working, state.session + 1)
+
+
+@jax.jit
+def _closed(
+    method: Method,
+    state: LMEState,
+    point: _Iterate,
+    program: Any,
+    evidence: Evidence,
+    seen: Bool[Array, "n L"],
+) -> tuple[LMEState, SessionInfo]:
+    key, sample = jax.random.split(point.key)
+    plan = method.plan(point.weights, point.values)
+    completed = method.e_step(sample, plan, evidence, seen)
+    return _close(method, state, point._replace(key=key), program, plan, completed)
+
+
+@jax.jit
+def _initial(method: Method, key: Array) -> LMEState:
+    key, fresh = jax.random.split(key)
+    weights = random_weights(fresh, method.mdp)
+    empty = method.statistic.empty(method.mdp)
+    return LMEState(weights, empty, jnp.zeros(method.mdp.n_states), (), jnp.zeros((), int), key)
+
+
+@jax.jit
+def _log_likelihood(method: Method, state: LMEState, weights: Float[Array, " K"]) -> Float[Array, ""]:
+    values = method.plan(weights, state.values).values
+    return method.statistic.log_likelihood(method.mdp, weights, values, state.statistic)
+
+
 def _learner(
     name: str,
     method: Method,
-    start: Callable[[Array, LMEState], tuple],
+    start: Start,
     solver: str,
     alternation: Alternation,
     configuration: Mapping[str, Any],
 ) -> Learner:
     mdp = method.mdp
     iterations, tolerance, _ = alternation
-    in_jax = {"newton": newton, "exponentiated gradient": exponentiated}
-    if solver not in (*in_jax, "ipopt", "cvxpy"):
+    if solver not in (*_IN_JAX, "ipopt", "cvxpy"):
         raise ValueError(f"solver must be newton, ipopt, cvxpy or exponentiated gradient, got {solver!r}")
     if solver in ("cvxpy", "exponentiated gradient"):
         if method.statistic.name != "features":
@@ -379,62 +460,24 @@ def _learner(
     if iterations < 1:
         raise ValueError(f"a session needs at least one iteration, got {iterations}")
 
-    def begin(state: LMEState, demonstration: Demonstration) -> tuple:
-        evidence = evidence_of(mdp, method.sensor, demonstration)
-        seen = jnp.asarray(demonstration.kind) == SEEN_STEP
-        key, fresh = jax.random.split(state.key)
-        return evidence, seen, key, *start(fresh, state)
-
     run: Callable[[LMEState, Demonstration], tuple[LMEState, SessionInfo]]
-    if solver in in_jax:
-
-        def session(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, SessionInfo]:
-            evidence, seen, key, weights, values = begin(state, demonstration)
-            ending = _em(
-                method,
-                in_jax[solver],
-                alternation,
-                _Session(state.session + 1, state.statistic, evidence, seen),
-                key,
-                weights,
-                values,
-            )
-            return _close(method, state, ending.point, state.program, ending.plan, ending.completed)
-
-        run = jax.jit(session)
+    session = None
+    if solver in _IN_JAX:
+        session = partial(_session, solver, start, method, alternation)
+        run = partial(_learned, solver, start, method, alternation)
         empty_program: Any = ()
     else:
         from ..programs.host import host_solver
 
         solve, empty_program = host_solver(mdp, solver, method.statistic.name)
-        opening = jax.jit(begin)
-
-        @jax.jit
-        def closing(
-            state: LMEState, point: _Iterate, program: Any, evidence: Evidence, seen: Array
-        ) -> tuple[LMEState, SessionInfo]:
-            key, sample = jax.random.split(point.key)
-            plan = method.plan(point.weights, point.values)
-            completed = method.e_step(sample, plan, evidence, seen)
-            return _close(method, state, point._replace(key=key), program, plan, completed)
-
-        @jax.jit
-        def expectation(
-            state: LMEState, key: Array, weights: Array, values: Array, evidence: Evidence, seen: Array
-        ) -> tuple:
-            key, sample = jax.random.split(key)
-            plan = method.plan(weights, values)
-            working, own = method.working(state.statistic, sample, plan, evidence, seen)
-            gradient = method.gradient(plan, working)
-            return key, plan.values, own, gradient, working, *method.penalties(working, state.session + 1)
 
         def run(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, SessionInfo]:
-            evidence, seen, key, weights, values = opening(state, demonstration)
+            evidence, seen, key, weights, values = _begun(start, method, state, demonstration)
             program, total, steps, change, converged = state.program, 0, 0, np.inf, False
             first = jnp.array(jnp.nan)
             while steps < iterations and change > tolerance:
-                key, values, own, gradient, working, slack, ridge = expectation(
-                    state._replace(program=()), key, weights, values, evidence, seen
+                key, values, own, gradient, working, slack, ridge = _expected(
+                    method, state._replace(program=()), key, weights, values, evidence, seen
                 )
                 if not np.isfinite(own):  # no program to solve: update names the impossible step
                     break
@@ -452,23 +495,10 @@ def _learner(
                 jnp.array(converged),
             )
             point = _Iterate(weights, values, *counted, key)
-            return closing(state, point, program, evidence, seen)
-
-    @jax.jit
-    def begun(key: Array) -> LMEState:
-        key, fresh = jax.random.split(key)
-        weights = random_weights(fresh, mdp)
-        return LMEState(
-            weights,
-            method.statistic.empty(mdp),
-            jnp.zeros(mdp.n_states),
-            (),
-            jnp.zeros((), int),
-            key,
-        )
+            return _closed(method, state, point, program, evidence, seen)
 
     def init(key: Array) -> LMEState:
-        return begun(as_key(key))._replace(program=empty_program)
+        return _initial(method, as_key(key))._replace(program=empty_program)
 
     def update(state: LMEState, demonstration: Demonstration) -> tuple[LMEState, SessionInfo]:
         began = time.perf_counter()
@@ -480,17 +510,10 @@ def _learner(
             raise DemonstrationError("a trajectory has probability zero under the current policy")
         return new, info.in_plain_numbers(time.perf_counter() - began)
 
-    @jax.jit
-    def likelihood(state: LMEState, weights: Float[Array, " K"]) -> Float[Array, ""]:
-        values = method.plan(weights, state.values).values
-        return method.statistic.log_likelihood(mdp, weights, values, state.statistic)
-
     def log_likelihood(state: LMEState, weights: Float[Array, " K"]) -> float:
-        return float(likelihood(state, jnp.asarray(weights, float)))
+        return float(_log_likelihood(method, state, jnp.asarray(weights, float)))
 
-    return Learner(
-        name, mdp, configuration, init, update, session if solver in in_jax else None, log_likelihood
-    )
+    return Learner(name, mdp, configuration, init, update, session, log_likelihood)
 
 
 # -- batch --------------------------------------------------------------------------------------------
@@ -527,6 +550,29 @@ class Batch(NamedTuple):
 
     name: str
     fit: Callable[[Array, Demonstration], BatchFit]
+
+
+@partial(jax.jit, static_argnums=0)
+def _fit(
+    restarts: int, method: Method, alternation: Alternation, key: Array, demonstration: Demonstration
+) -> tuple:
+    mdp = method.mdp
+    evidence = evidence_of(mdp, method.sensor, demonstration)
+    seen = jnp.asarray(demonstration.kind) == SEEN_STEP
+    session = _Session(jnp.ones((), int), method.statistic.empty(mdp), evidence, seen)
+
+    def from_start(key: Array) -> tuple:
+        weights = random_weights(key, mdp)
+        ending = _em(method, newton, alternation, session, key, weights, jnp.zeros(mdp.n_states))
+        point, expectations = ending.point, ending.completed.expectations
+        size = jnp.maximum(expectations.size, 1.0)
+        average = jnp.sum(expectations.log_likelihood) / size
+        penalty = method.slack * jnp.sum(jnp.abs(point.weights))
+        penalty += method.ridge / size / 2 * jnp.sum(point.weights**2)
+        return point.weights, average, average - penalty, point.iterations, point.converged
+
+    # One start after another: memory stays that of one, and no start waits for the slowest.
+    return lax.map(from_start, jax.random.split(key, restarts))
 
 
 def batch_lme(
@@ -569,32 +615,7 @@ def batch_lme(
     given, mdp = mdp, with_scaled_features(mdp)
     scale = np.asarray(feature_scale(given))
     method = checked_method(mdp, sensor, "counts", "exact", slack, ridge, 0)
-
-    @jax.jit
-    def fit(key: Array, demonstration: Demonstration) -> tuple:
-        evidence = evidence_of(mdp, sensor, demonstration)
-        seen = jnp.asarray(demonstration.kind) == SEEN_STEP
-        kept = method.statistic.empty(mdp)
-
-        def from_start(key: Array) -> tuple:
-            weights = random_weights(key, mdp)
-            ending = _em(
-                method,
-                newton,
-                Alternation(iterations, tolerance),
-                _Session(jnp.ones((), int), kept, evidence, seen),
-                key,
-                weights,
-                jnp.zeros(mdp.n_states),
-            )
-            point, expectations = ending.point, ending.completed.expectations
-            size = jnp.maximum(expectations.size, 1.0)
-            average = jnp.sum(expectations.log_likelihood) / size
-            penalty = slack * jnp.sum(jnp.abs(point.weights)) + ridge / size / 2 * jnp.sum(point.weights**2)
-            return point.weights, average, average - penalty, point.iterations, point.converged
-
-        # One start after another: memory stays that of one, and no start waits for the slowest.
-        return lax.map(from_start, jax.random.split(key, restarts))
+    fit = partial(_fit, restarts, method, Alternation(iterations, tolerance))
 
     def checked(key: Array, demonstration: Demonstration) -> BatchFit:
         key = as_key(key)
