@@ -1,4 +1,5 @@
 from dataclasses import replace
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -7,7 +8,7 @@ import numpyro.distributions as dist
 import pytest
 from jax import monitoring
 
-from i2rl.inference import Harmonic, batch_lme, batch_mme_mtirl, lme_i2rl, sample_posterior
+from i2rl.inference import Harmonic, batch_lme, batch_mme_mtirl, lme_i2rl, run_sessions, sample_posterior
 from i2rl.models import (
     Visibility,
     feature_expectations,
@@ -124,6 +125,32 @@ def test_learners_that_differ_in_numbers_share_a_program(random_mdp, imperfect_d
 
     batch(mdp, view)
     assert compilations(lambda: batch(other, half, slack=0.1, ridge=2.0, iterations=3)) == 0
+
+
+def test_schedules_that_are_equal_as_tuples_are_told_apart(random_mdp, imperfect_demonstration):
+    class Rising(NamedTuple):
+        c: float
+
+        def __call__(self, session):
+            return self.c * session
+
+    class Falling(Rising):
+        def __call__(self, session):
+            return self.c / session
+
+    assert Rising(0.1) == Falling(0.1)
+    mdp, key = random_mdp(0), jax.random.key(0)
+    view = Visibility(np.array([True, True, False, True]))
+    log_policy = soft_plan(mdp, reward_of(mdp, jnp.array([1.0, -1.0]))).log_policy
+    demonstration = imperfect_demonstration(0, mdp, log_policy, view, 6, 5)
+
+    def learned(slack):
+        learner = lme_i2rl(mdp, view, slack=slack)
+        return run_sessions(learner, demonstration.sessions(3), key=key).state.weights
+
+    np.testing.assert_allclose(learned(Rising(0.1)), learned(lambda n: 0.1 * n), rtol=1e-9)
+    np.testing.assert_allclose(learned(Falling(0.1)), learned(lambda n: 0.1 / n), rtol=1e-9)
+    assert not np.allclose(learned(Rising(0.1)), learned(Falling(0.1)))
 
 
 def test_a_sensor_of_another_library_is_part_of_the_program(random_mdp, imperfect_demonstration):

@@ -159,7 +159,8 @@ def checked_method(
         raise ValueError(f"ridge must not be negative, got {ridge}")
 
     if callable(slack) and not isinstance(slack, Harmonic):
-        slack = jax.tree_util.Partial(lambda session, schedule=slack: schedule(session))
+        # The bound call, since it is compared by identity: schedules may be equal tuples, or have no hash.
+        slack = jax.tree_util.Partial(slack.__call__)
     return Method(
         mdp,
         _as_data(sensor),

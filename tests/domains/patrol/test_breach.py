@@ -137,7 +137,9 @@ def current_beliefs(mdp, log_policies, sensor, codes, watcher=watch):
 
     @jax.jit
     def one(log_policy, codes):
-        step = lambda belief, code: (watcher(mdp, log_policy, sensor, belief, code), None)  # noqa: E731
+        def step(belief, code):
+            return watcher(mdp, log_policy, sensor, belief, code), None
+
         return jax.lax.scan(step, mdp.initial, codes)[0]
 
     return jnp.stack([one(*each) for each in zip(log_policies, jnp.asarray(codes), strict=True)])

@@ -345,10 +345,14 @@ def test_schedules_are_told_apart_by_their_values(mdp, sensor):
 
 def test_a_schedule_that_turns_negative_late_is_refused_when_it_does(mdp, sensor):
     demonstration = Demonstration.from_pairs([[0]], [[1]])
-    learner = lme_i2rl(mdp, sensor, slack=lambda i: 256 - i / 4)
+
+    def falling(session):
+        return 256 - session / 4
+
+    learner = lme_i2rl(mdp, sensor, slack=falling)
     state = learner.init(jax.random.key(0))._replace(session=jnp.array(1023))
     state, _ = learner.update(state, demonstration)
-    with pytest.raises(ValueError, match=r"gives -0\.25 in session 1025"):
+    with pytest.raises(ValueError, match=r"schedule falling gives -0\.25 in session 1025"):
         learner.update(state, demonstration)
     # A fleet cannot raise, but its weights stay unchanged.
     one = jax.tree.map(lambda x: x[None], state)
