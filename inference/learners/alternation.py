@@ -160,7 +160,8 @@ def checked_method(
 
     if callable(slack) and not isinstance(slack, Harmonic):
         # The bound call, since it is compared by identity: schedules may be equal tuples, or have no hash.
-        slack = jax.tree_util.Partial(slack.__call__)
+        schedule: Any = slack
+        slack = jax.tree_util.Partial(schedule.__call__)
     return Method(
         mdp,
         _as_data(sensor),

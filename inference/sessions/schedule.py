@@ -121,5 +121,6 @@ def _values(schedule: Callable[[Any], Any]) -> Float[np.ndarray, " EXAMINED"]:
 
 def _name(schedule: Any) -> str:
     if isinstance(schedule, jax.tree_util.Partial):  # within a learner
-        schedule = schedule.func.__self__
+        bound: Any = schedule.func
+        schedule = bound.__self__
     return repr(schedule) if isinstance(schedule, tuple) else getattr(schedule, "__name__", repr(schedule))
