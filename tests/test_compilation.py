@@ -6,10 +6,10 @@ import time
 import pytest
 
 import i2rl.compilation
-from i2rl.compilation import keep_programs
+from i2rl.compilation import compile_quickly, keep_programs
 
 PROGRAM = """
-from i2rl.compilation import keep_programs
+from i2rl.compilation import compile_quickly, keep_programs
 print(keep_programs())
 import jax, jax.numpy as jnp
 jax.jit(lambda x: jnp.linalg.inv(x @ x.T) @ x)(jnp.eye(5)).block_until_ready()
@@ -106,9 +106,17 @@ jax.jit(jnp.sin)(1.0).block_until_ready()
 """
 
 
-def test_programs_are_compiled_at_the_first_level_unless_one_is_named():
-    assert run(LEVEL, XLA_FLAGS="").stdout.strip() == "--xla_backend_optimization_level=1"
+def test_programs_are_compiled_quickly_unless_the_user_decides_otherwise():
+    level, loops = "--xla_backend_optimization_level=1", "--xla_cpu_use_fusion_emitters=false"
+    assert run(LEVEL, XLA_FLAGS="").stdout.strip() == f"{level} {loops}"
     fast = "--xla_cpu_enable_fast_math=true"
-    assert run(LEVEL, XLA_FLAGS=fast).stdout.strip() == f"{fast} --xla_backend_optimization_level=1"
-    named = "--xla_backend_optimization_level=2"
+    assert run(LEVEL, XLA_FLAGS=fast).stdout.strip() == f"{fast} {level} {loops}"
+    named = "--xla_backend_optimization_level=2 --xla_cpu_use_fusion_emitters=true"
     assert run(LEVEL, XLA_FLAGS=named).stdout.strip() == named
+
+
+def test_a_release_that_may_not_know_a_flag_is_not_asked(monkeypatch):
+    monkeypatch.setattr("i2rl.compilation.version", lambda package: "99.1.0")
+    monkeypatch.setenv("XLA_FLAGS", "")
+    compile_quickly()
+    assert os.environ["XLA_FLAGS"] == "--xla_backend_optimization_level=1"
