@@ -43,6 +43,7 @@ experts: $(READY)
 
 bench: $(READY)
 	$(BIN)/python -m i2rl.analysis.benchmarks.cost.sessions
+	$(BIN)/python -m i2rl.analysis.benchmarks.cost.learners
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.accuracy
 	$(BIN)/python -m i2rl.analysis.benchmarks.cost.planning
 	$(BIN)/python -m i2rl.analysis.benchmarks.cost.posterior
