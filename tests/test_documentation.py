@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import i2rl
 from i2rl.analysis.command.app import app
 from i2rl.analysis.studies.adversarial import cases
+from i2rl.analysis.studies.noisy import study as noisy_study
 from i2rl.domains import mouse_labyrinth, simulate_bouts
 
 ROOT = Path(i2rl.__file__).resolve().parent
@@ -90,8 +91,17 @@ def folder(tmp_path_factory):
 def test_a_command_of_the_pages_runs(line, folder, monkeypatch):
     """Run it as shown, with fewer sessions and the like; learning comes before showing what was learned."""
     monkeypatch.chdir(folder)
-    robot = cases.PLANS["hopper"]
-    monkeypatch.setitem(cases.PLANS, "hopper", robot._replace(iterations=1, updates=1, episodes=1))
+    # Few methods, and a few steps of networks: the studies' own tests run the others.
+    monkeypatch.setattr(noisy_study, "METHODS", (noisy_study.PLAIN, noisy_study.FAIR))
+    plan = cases.PLANS["hopper"]
+    small = {"n_envs": 4, "n_steps": 16, "hidden": (8, 8)}
+    monkeypatch.setitem(
+        cases.PLANS,
+        "hopper",
+        plan._replace(
+            iterations=1, updates=1, episodes=1, settings=tuple({**dict(plan.settings), **small}.items())
+        ),
+    )
     smaller = next((options for start, options in SMALLER.items() if line.startswith(start)), "")
     result = CliRunner().invoke(app, shlex.split(f"{line} {smaller}")[1:])
     assert result.exit_code == 0, (result.output, result.exception)
