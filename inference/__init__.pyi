@@ -149,6 +149,9 @@ from .sessions.schedule import (
     Harmonic as Harmonic,
 )
 from .sessions.stopping import (
+    LearningErrorChange as LearningErrorChange,
+)
+from .sessions.stopping import (
     LikelihoodChange as LikelihoodChange,
 )
 from .sessions.stopping import (

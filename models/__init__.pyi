@@ -4,6 +4,9 @@ from .inputs.archives import (
 from .laws.feature_noise import (
     observation_feature_model as observation_feature_model,
 )
+from .laws.feature_noise import (
+    sample_observation_features as sample_observation_features,
+)
 from .laws.mixture import (
     MixtureLaw as MixtureLaw,
 )
@@ -24,6 +27,9 @@ from .laws.trajectory import (
 )
 from .laws.trajectory import (
     sample_demonstration as sample_demonstration,
+)
+from .observation.agreement import (
+    reported_matches as reported_matches,
 )
 from .observation.confusions import (
     Confusions as Confusions,

@@ -82,26 +82,6 @@ IN_ITS_OWN_SENSE = {
     ("sweeps", "inference/completion/gibbs.py:GaussianGibbs"): "sweeps of a Gibbs sampler",
 }
 
-# Public names older than the glossary; the list only shrinks.
-OLDER = {
-    ("report", "models/observation/confusions.py:confused"),
-    ("rate", "models/process/planning.py:solve_values"),
-    ("shown", "inference/adversarial/noise_injection.py:steps"),
-    ("shown", "inference/adversarial/noise_injection.py:NoisyTraining"),
-    ("reading", "inference/completion/kalman.py:AffineGaussian"),
-    ("readings", "inference/completion/kalman.py:filter_gaussian"),
-    ("report", "inference/journal/journal.py:SessionRecord"),
-    ("report", "inference/journal/journal.py:commit"),
-    ("decided", "inference/learners/identification.py:SensorIdentification"),
-    ("reports", "inference/learners/noisy.py:RIMEOState"),
-    ("sweeps", "inference/programs/printed/minmax.py:ascend_printed"),
-    ("report", "inference/sensors/confusions.py:confused"),
-    ("reports", "inference/sensors/observations.py:report_log_evidence"),
-    ("reports", "inference/sensors/observations.py:score_statistic"),
-    ("reports", "inference/sensors/observations.py:report_statistic"),
-    ("reports", "inference/sensors/reliabilities.py:PreparedSession"),
-}
-
 
 def docstrings(path: Path) -> list[str]:
     """Docstrings of a file, of its types and of its functions."""
@@ -147,7 +127,7 @@ def test_public_names_are_the_glossarys(folder):
         if "benchmarks" not in path.parts
         for name, owner in public_names(path)
         for where in [f"{path.relative_to(ROOT)}:{owner}"]
-        if name in OTHER_WORDS and (name, where) not in {*OLDER, *IN_ITS_OWN_SENSE}
+        if name in OTHER_WORDS and (name, where) not in IN_ITS_OWN_SENSE
     ]
     assert others == []
 

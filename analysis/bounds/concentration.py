@@ -1,9 +1,10 @@
 """Concentration of a mean of independent values in [0, 1] about its expectation.
 
-Hoeffding's inequality, which the dissertation's theorems use, depends only on the range. For values that vary
-little, such as discounted feature averages, the observed variance gives much narrower intervals: Maurer and
-Pontil (2009), and the predictable plug-in intervals of Waudby-Smith and Ramdas (2023), whose confidence
-sequence holds at all sample sizes at once, so that an online learner may check it after every session.
+Hoeffding's inequality, which the dissertation's theorems use, depends only on the range
+(:func:`~i2rl.analysis.bounds.theorems.error_for`). For values that vary little, such as discounted feature
+averages, the observed variance gives much narrower intervals: Maurer and Pontil (2009), and the predictable
+plug-in intervals of Waudby-Smith and Ramdas (2023), whose confidence sequence holds at all sample sizes at
+once, so that an online learner may check it after every session.
 
 Values are ``[..., n, K]``: ``n`` independent observations of ``K`` quantities. ``delta`` is the failure
 probability of *one* quantity's two-sided interval; for ``K`` at once give ``delta / K`` (union bound).
@@ -17,8 +18,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 from scipy.special import digamma, polygamma
-
-from .checks import positive
 
 # Largest bet of the predictable intervals; Waudby-Smith and Ramdas (2023) recommend 1/2 or 3/4.
 _LARGEST_BET = 0.75
@@ -38,14 +37,6 @@ class Interval(NamedTuple):
 # -- intervals ----------------------------------------------------------------------------------------
 
 
-def hoeffding(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
-    """Compute Hoeffding's interval ``mean +- sqrt(log(2 / delta) / (2 n))``."""
-    values = _in_unit_interval(values)
-    half = np.sqrt(_log(delta) / (2 * values.shape[-2]))
-    center = values.mean(axis=-2)
-    return Interval(center, np.full_like(center, half))
-
-
 def empirical_bernstein(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
     """Compute an interval from the observed variance (Maurer and Pontil 2009, Theorem 4).
 
@@ -54,7 +45,9 @@ def empirical_bernstein(values: Float[np.ndarray, "... n K"], delta: float) -> I
     """
     values = _in_unit_interval(values, least=2)
     n = values.shape[-2]
-    return Interval(values.mean(axis=-2), _bernstein(values.var(axis=-2, ddof=1), n, delta))
+    log = _log(delta / 2)
+    half = np.sqrt(2 * values.var(axis=-2, ddof=1) * log / n) + 7 * log / (3 * (n - 1))
+    return Interval(values.mean(axis=-2), half)
 
 
 def predictable_bernstein(values: Float[np.ndarray, "... n K"], delta: float) -> Interval:
@@ -88,11 +81,6 @@ def confidence_sequence(values: Float[np.ndarray, "... n K"], delta: float) -> I
     )
 
 
-def _bernstein(variance: np.ndarray, n: int, delta: float) -> np.ndarray:
-    log = _log(delta / 2)
-    return np.sqrt(2 * variance * log / n) + 7 * log / (3 * (n - 1))
-
-
 def _bets(
     values: np.ndarray, horizon: Callable[[np.ndarray], np.ndarray], delta: float
 ) -> tuple[np.ndarray, np.ndarray]:
@@ -117,28 +105,6 @@ def _cost(bets: np.ndarray) -> np.ndarray:
 
 
 # -- sample sizes -------------------------------------------------------------------------------------
-
-
-def hoeffding_size(error: float, delta: float) -> float:
-    """Compute the size at which Hoeffding's half-width is ``error``: ``log(2 / delta) / (2 error^2)``,
-    unrounded.
-    """
-    return _log(delta) / (2 * positive("error", error) ** 2)
-
-
-def hoeffding_error(size: float, delta: float) -> float:
-    """Compute Hoeffding's half-width after ``size`` values."""
-    return float(np.sqrt(_log(delta) / (2 * positive("size", size))))
-
-
-def bernstein_size(deviation: float, error: float, delta: float) -> int:
-    """Compute the smallest size at which :func:`empirical_bernstein` is as narrow as ``error``.
-
-    ``deviation`` is the values' standard deviation, taken to be what will be observed: a plan, while the
-    guarantee is the interval computed from the data themselves.
-    """
-    positive("error", error)
-    return smallest(lambda n: _bernstein(np.asarray(deviation**2), n, delta) <= error, least=2)
 
 
 def predictable_half_width(deviation: float, size: int, delta: float) -> float:
@@ -167,17 +133,9 @@ def _blocks(size: int) -> tuple[np.ndarray, np.ndarray]:
     return np.append(t, edges[:-1] + (count + 1) / 2), np.append(np.ones(first), count)
 
 
-def predictable_size(deviation: float, error: float, delta: float) -> int:
-    """Compute the smallest size at which :func:`predictable_bernstein` is as narrow as ``error``; a plan
-    likewise.
-    """
-    positive("error", error)
-    return smallest(lambda n: predictable_half_width(deviation, n, delta) <= error)
-
-
-def smallest(enough: Callable[[int], object], least: int = 1) -> int:
-    """Find the smallest integer from ``least`` on that is enough, by doubling and bisection."""
-    low, high = least - 1, max(least, 1)
+def smallest(enough: Callable[[int], object]) -> int:
+    """Find the smallest positive integer that is enough, by doubling and bisection."""
+    low, high = 0, 1
     while not enough(high):
         low, high = high, 2 * high
     while high - low > 1:

@@ -102,7 +102,9 @@ def me_i2rl_confidence(size: float, epsilon: float, n_features: int, discount: f
 
     ``LL(theta_E) - LL(theta^i) <= 2 K epsilon / (1 - gamma)`` with probability at least ``max(0, 1 -
     delta)``, ``delta = 2 K exp(-2 n epsilon^2)``. Inverses: :func:`size_for` and :func:`error_for` with ``K``
-    events. Raises ``ValueError`` for sizes or errors that are not positive, or a discount outside [0, 1).
+    events. The first Theorem 4 of appendix B states the same by its error ``e`` in nats, ``delta = 2 K exp(-n
+    e^2 (1 - gamma)^2 / (2 K^2))``. Raises ``ValueError`` for sizes or errors that are not positive, or a
+    discount outside [0, 1).
 
     See Also
     --------
@@ -129,17 +131,6 @@ def me_i2rl_confidence(size: float, epsilon: float, n_features: int, discount: f
         epsilon,
         (*EXPERT, FULL_VIEW, *PROGRAM_SOLVED),
     )
-
-
-def maximum_entropy_confidence(size: float, error: float, n_features: int, discount: float) -> Bound:
-    """Bound by Theorem 4 of appendix B (first of that number): the same bound by its log-likelihood error.
-
-    ``LL(theta_E) - LL(theta) <= error`` nats with ``delta = 2 K exp(-n error^2 (1 - gamma)^2 / (2 K^2))``.
-    """
-    positive("error", error), counted("n_features", n_features)
-    epsilon = error * (1 - discounted(discount)) / (2 * n_features)
-    bound = me_i2rl_confidence(size, epsilon, n_features, discount)
-    return bound._replace(source="Theorem 4 of appendix B (confidence for maximum entropy IRL)")
 
 
 def lme_constraint_bound(

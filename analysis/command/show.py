@@ -59,7 +59,7 @@ def _print_sessions(view: JournalView, last: int | None) -> None:
             "session": r.session,
             "committed": r.committed,
             "weights": r.weights.tolist(),
-            **plain(r.report),
+            **plain(r.info),
         }
         print(f"{',' if i else ''}\n{json.dumps(fields)}", end="")
     print("\n]}")
@@ -83,19 +83,19 @@ def _print_history(view: JournalView, records: list[SessionRecord]) -> None:
     table = Table(title=f"Last {len(records)} sessions")
     formats = {"log_likelihood": ".4f", "iterations": ".0f", "seconds": ".4f"}
     titles = {"log_likelihood": "log-likelihood (nats/trajectory)", "iterations": "EM steps"}
-    shown = [name for name in formats if name in records[-1].report]
+    shown = [name for name in formats if name in records[-1].info]
     for column in ("session", *(titles.get(name, name) for name in shown)):
         table.add_column(column, justify="right")
     for r in records:
-        table.add_row(str(r.session), *(f"{float(r.report[name]):{formats[name]}}" for name in shown))
+        table.add_row(str(r.session), *(f"{float(r.info[name]):{formats[name]}}" for name in shown))
     console.print(table)
     weights = records[-1].weights
     if weights.shape[-1:] == (len(origin.feature_names),) and weights.ndim <= 2:
         print_rewards(console, origin.feature_names, weights, "Reward weights")
-    if "agreement" in records[-1].report:
+    if "agreement" in records[-1].info:
         sensor = Table(title="Agreement of observations with the truth")
         sensor.add_column("predicate")
         sensor.add_column("agreement", justify="right")
-        for j, agreement in enumerate(records[-1].report["agreement"]):
+        for j, agreement in enumerate(records[-1].info["agreement"]):
             sensor.add_row(str(j), f"{agreement:.3f}")
         console.print(sensor)

@@ -8,7 +8,7 @@ from the policy.
 
 Each step has two actions: the *intended* one, drawn from the policy, and the *executed* one. A rollout holds
 the intended actions, so its log-probabilities are those of the policy and PPO improves on-policy. The
-discriminator sees one of them (``shown``). The released code uses the intended action and its weight; action
+discriminator sees one of them (``action``). The released code uses the intended action and its weight; action
 and successor then do not match, which a reward of states alone does not notice. The weights of the executed
 action are the correct ones for the mixture: ``E_executed[w g] = E_policy[g]`` at each state.
 """
@@ -57,7 +57,7 @@ else:
 LEVELS = (0.0, 0.0, 0.0, 0.0, 0.0, 0.05, 0.10, 0.15, 0.20, 0.25)
 """Probabilities of a random action in the generator's ten environments, as released."""
 
-SHOWN = ("intended", "executed")
+ACTIONS = ("intended", "executed")
 
 # -- random actions ---------------------------------------------------------------------------------------
 
@@ -119,9 +119,9 @@ class NoisyRollout(NamedTuple):
     rollout: Rollout
     executed: Array
 
-    def steps(self, shown: str) -> Transitions:
+    def steps(self, action: str) -> Transitions:
         """Return transitions ``[T, n, ...]`` with the ``intended`` or the ``executed`` actions, as drawn."""
-        chosen = self.executed if shown == "executed" else self.rollout.actions
+        chosen = self.executed if action == "executed" else self.rollout.actions
         return Transitions(
             self.rollout.observations, chosen, self.rollout.next_observations, self.rollout.terminated
         )
@@ -227,7 +227,7 @@ class NoisyTraining(NamedTuple):
         the current policy. The released code uses the policy of their time, for which the log-odds are
         wrong.
     levels : probabilities of a random action, dealt out to the environments in turn
-    shown : "intended" (as released) or "executed", the action that the discriminator sees and weighs
+    action : "intended" (as released) or "executed", the action that the discriminator sees and weighs
     """
 
     iterations: int = 10
@@ -236,15 +236,15 @@ class NoisyTraining(NamedTuple):
     learning_rate: float = 1e-3
     replay: int = 20
     levels: Sequence[float] = LEVELS
-    shown: str = "intended"
+    action: str = "intended"
 
     def checked(self, environments: int) -> NoisyTraining:
         """Validate the settings and return them. Raises ``ValueError`` naming an invalid field."""
         for name in ("iterations", "updates", "batch", "replay"):
             if getattr(self, name) < 1:
                 raise ValueError(f"{name} must be at least 1, got {getattr(self, name)}")
-        if self.shown not in SHOWN:
-            raise ValueError(f"the action shown is one of {', '.join(SHOWN)}, got {self.shown!r}")
+        if self.action not in ACTIONS:
+            raise ValueError(f"`action` must be one of {', '.join(ACTIONS)}; got {self.action!r}")
         for i, level in enumerate(self.levels):
             if not 0 <= level < 1:
                 raise ValueError(f"noise level {i} must be a probability below 1, got {level}")
@@ -325,7 +325,7 @@ def noisy_airl(
             key, k_collect, k_updates = jax.random.split(key, 3)
             before = acting.running
             acting, noisy = _acted(agent, acting, levels, k_collect)
-            replay = remembered(replay, noisy.steps(how.shown), iterations % how.replay)
+            replay = remembered(replay, noisy.steps(how.action), iterations % how.replay)
             iterations += 1
             network, memory, last = trained(
                 network, memory, acting.policy, expert, replay, min(iterations, how.replay), k_updates
@@ -347,7 +347,9 @@ def noisy_airl(
         )
         return state, session_info(state, expert, losses, returns, began)
 
-    known = {**identity(agent, discriminator), **how._asdict(), **dict(configuration or {})}
+    # The field's name in the journals of earlier versions.
+    stored = {"shown" if name == "action" else name: x for name, x in how._asdict().items()}
+    known = {**identity(agent, discriminator), **stored, **dict(configuration or {})}
     return Learner("noisy-AIRL", task, known, init, update)  # type: ignore[arg-type]
 
 
@@ -378,7 +380,7 @@ def _objective(discriminator: Discriminator, levels: Float[Array, " n"]) -> Obje
         at = levels[places % levels.shape[0]]
         # Weights are of the action as drawn: beyond the bounds it cannot have been a random one.
         importance = importance_weights(policy, generated.observations, generated.actions, at)
-        shown = _within(network.actions, generated)
-        return cross_entropy(discriminator, network, policy, expert, weights, shown, importance=importance)
+        drawn = _within(network.actions, generated)
+        return cross_entropy(discriminator, network, policy, expert, weights, drawn, importance=importance)
 
     return objective

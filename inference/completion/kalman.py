@@ -31,7 +31,7 @@ class AffineGaussian(NamedTuple):
         Law of the first state.
     transition, offset, noise : float ``[L - 1, D, D]``, ``[L - 1, D]``, ``[L - 1, D, D]``
         ``F_t``, ``b_t`` and ``Q_t``.
-    reading, reading_noise : float ``[m, D]``, ``[L, m, m]``
+    observation, observation_noise : float ``[m, D]``, ``[L, m, m]``
         ``H`` and ``R_t``.
     """
 
@@ -40,8 +40,8 @@ class AffineGaussian(NamedTuple):
     transition: Float[Array, "T D D"]
     offset: Float[Array, "T D"]
     noise: Float[Array, "T D D"]
-    reading: Float[Array, "m D"]
-    reading_noise: Float[Array, "L m m"]
+    observation: Float[Array, "m D"]
+    observation_noise: Float[Array, "L m m"]
 
 
 @shown_briefly
@@ -91,11 +91,11 @@ def _symmetric(matrix: Array) -> Array:
 
 
 def filter_gaussian(
-    chain: AffineGaussian, readings: Float[Array, "L m"], read: Bool[Array, " L"]
+    chain: AffineGaussian, observations: Float[Array, "L m"], observed: Bool[Array, " L"]
 ) -> GaussianFiltered:
-    """Run the forward pass; steps with ``read`` false (padding, hidden steps) have no observation."""
+    """Run the forward pass; steps with ``observed`` false (padding, hidden steps) have no observation."""
     identity = jnp.eye(chain.mean.shape[0])
-    H = chain.reading
+    H = chain.observation
 
     def update(mean: Array, covariance: Array, y: Array, R: Array, there: Array) -> tuple:
         S = jnp.linalg.cholesky(H @ covariance @ H.T + R)
@@ -123,14 +123,14 @@ def filter_gaussian(
         following, spread, log_p = update(predicted, ahead, y, R, there)
         return (following, spread, total + log_p), (following, spread, predicted, gain, conditional)
 
-    first = update(chain.mean, chain.covariance, readings[0], chain.reading_noise[0], read[0])
+    first = update(chain.mean, chain.covariance, observations[0], chain.observation_noise[0], observed[0])
     inputs = (
         chain.transition,
         chain.offset,
         chain.noise,
-        readings[1:],
-        chain.reading_noise[1:],
-        read[1:],
+        observations[1:],
+        chain.observation_noise[1:],
+        observed[1:],
     )
     passed: tuple = lax.scan(step, first, inputs)
     (_, _, total), (means, covariances, predicted, gains, conditional) = passed
@@ -183,7 +183,7 @@ def sample_filtered(key: Array, filtered: GaussianFiltered, draws: int) -> Float
 
 
 def log_density_filtered(
-    filtered: GaussianFiltered, states: Float[Array, "L D"], read: Bool[Array, " L"]
+    filtered: GaussianFiltered, states: Float[Array, "L D"], observed: Bool[Array, " L"]
 ) -> Float[Array, ""]:
     """Return the log-density of a chain given all observations, in nats, as :func:`sample_filtered` draws it.
 
@@ -197,7 +197,7 @@ def log_density_filtered(
     inputs = (filtered.means[:-1], filtered.predicted, filtered.gains, filtered.conditional, states[:-1])
     each: Array = lax.scan(step, states[-1], inputs, reverse=True)[1]
     last = _log_normal(states[-1] - filtered.means[-1], filtered.covariances[-1])
-    return jnp.sum(jnp.where(read, jnp.concatenate([each, last[None]]), 0.0))
+    return jnp.sum(jnp.where(observed, jnp.concatenate([each, last[None]]), 0.0))
 
 
 def _log_normal(difference: Float[Array, " D"], covariance: Float[Array, "D D"]) -> Float[Array, ""]:

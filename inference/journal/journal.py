@@ -135,7 +135,7 @@ class SessionRecord(NamedTuple):
         Time in seconds since 1970 (UTC).
     weights : float array
         The learner's weights after it, in the learner's own shape (``[K]`` for one reward).
-    report : dict
+    info : dict
         The info's fields by name (nested ones as ``outer.inner``), as NumPy values, text or None; a random
         key as its key data.
     position : Position
@@ -148,7 +148,7 @@ class SessionRecord(NamedTuple):
     session: int
     committed: float
     weights: np.ndarray
-    report: dict[str, Any]
+    info: dict[str, Any]
     position: Position
     demonstration: bytes = b""
 
@@ -373,7 +373,7 @@ class JournalView:
         return self._select(query, demonstration)[0][0]
 
     def stored_state(self) -> dict[str, Any]:
-        """Return the newest state's leaves by name (see :attr:`SessionRecord.report`); empty at first."""
+        """Return the newest state's leaves by name (see :attr:`SessionRecord.info`); empty at first."""
         try:
             return {name: leaf.plain for name, leaf in self._state_leaves().items()}
         except ValueError as error:
@@ -656,7 +656,7 @@ class Journal(JournalView):
             return view
 
     def commit(
-        self, state: Any, report: Any, position: Position | None = None, demonstration: bytes = b""
+        self, state: Any, info: Any, position: Position | None = None, demonstration: bytes = b""
     ) -> None:
         """Commit one session: all of it is durable when this returns.
 
@@ -664,7 +664,7 @@ class Journal(JournalView):
         ----------
         state : NamedTuple
             The learner's state after the session, with ``weights`` and the session's number in ``session``.
-        report : NamedTuple
+        info : NamedTuple
             The session's info.
         position : Position, optional
             The input consumed so far; by default unchanged.
@@ -685,10 +685,10 @@ class Journal(JournalView):
         session, last = int(state.session), self._newest.session
         if session <= last:
             raise ValueError(f"{self.path}: session {session} is already committed (the last is {last})")
-        weights, tree, told = encode(np.asarray(state.weights)), encode(state), encode(report)
+        weights, tree, told = encode(np.asarray(state.weights)), encode(state), encode(info)
         if max(len(weights), len(told)) > SESSION_BYTES:
             raise ValueError(
-                f"weights and report of a session must have at most {SESSION_BYTES:,} bytes each; got "
+                f"weights and info of a session must have at most {SESSION_BYTES:,} bytes each; got "
                 f"{len(weights):,} and {len(told):,}"
             )
         records, digest = self.position if position is None else position
@@ -911,7 +911,7 @@ def _dataset(records: Sequence[SessionRecord], origin: Origin) -> Any:
     import xarray
 
     reserved = {"weights", "committed", "records", "session", "feature"}
-    names = dict.fromkeys(name for record in records for name in record.report)
+    names = dict.fromkeys(name for record in records for name in record.info)
     columns: dict[str, Sequence[Any]] = {
         "weights": [record.weights for record in records],
         "committed": [np.datetime64(int(record.committed * 1e9), "ns") for record in records],
@@ -919,7 +919,7 @@ def _dataset(records: Sequence[SessionRecord], origin: Origin) -> Any:
     }
     for name in names:
         column = f"report_{name}" if name in reserved else name.replace(".", "_")
-        columns[column] = [record.report.get(name) for record in records]
+        columns[column] = [record.info.get(name) for record in records]
     variables = {}
     for column, values in columns.items():
         array = _stacked(values)

@@ -60,20 +60,14 @@ def boltzmann_log_likelihoods(
     unavailable action, naming trajectory, state and action (under a trace the trajectory's log-likelihood is
     ``-inf`` instead).
     """
-    require_available_visits(mdp, counts)
-    return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, rationality), counts)
-
-
-def count_log_likelihoods(
-    mdp: TabularMDP, log_policy: Float[Array, "S A"], counts: Float[Array, "n S A"]
-) -> Float[Array, " n"]:
-    """Return ``sum N_i log pi`` with ``0 log 0 = 0``."""
-    finite = jnp.where(mdp.available, log_policy, 0.0)
+    _require_available_visits(mdp, counts)
+    # 0 log 0 = 0
+    finite = jnp.where(mdp.available, boltzmann_log_policy(mdp, weights, rationality), 0.0)
     impossible = jnp.any((counts > 0) & ~mdp.available, axis=(1, 2))
     return jnp.where(impossible, -jnp.inf, jnp.einsum("nsa,sa->n", counts, finite))
 
 
-def require_available_visits(mdp: TabularMDP, counts: Float[Array, "n S A"]) -> None:
+def _require_available_visits(mdp: TabularMDP, counts: Float[Array, "n S A"]) -> None:
     """Raise ``DemonstrationError`` if a trajectory's counts visit an unavailable action."""
     if isinstance(counts, jax.core.Tracer) or isinstance(mdp.available, jax.core.Tracer):
         return

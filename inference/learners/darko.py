@@ -75,36 +75,16 @@ class Margin(NamedTuple):
 def feature_margin(
     mdp: TabularMDP,
     weights: Float[Array, " K"],
-    demonstration: Demonstration,
+    evidence: Evidence,
+    seen: Bool[Array, "n L"],
     values: Float[Array, " S"] | None = None,
 ) -> Margin:
     """Return the margin ``E[phi | pi] - phi_hat`` of a session alone, per trajectory, in discounted features.
 
-    Both expectations start at the session's first states. ``values [S]`` warm-starts the plan. The
-    margin is the gradient of ``start.V - theta.phi_hat``, the dual of ME-I2RL's ``features`` program for
-    this session's statistic.
+    Both expectations start at the session's first states. ``seen`` marks its observed steps, ``values [S]``
+    warm-starts the plan. The margin is the gradient of ``start.V - theta.phi_hat``, the dual of ME-I2RL's
+    ``features`` program for this session's statistic.
     """
-    return _session_margin(mdp, weights, checked_demonstration(mdp, demonstration), values)
-
-
-@jax.jit
-def _session_margin(
-    mdp: TabularMDP,
-    weights: Float[Array, " K"],
-    demonstration: Demonstration,
-    values: Float[Array, " S"] | None,
-) -> Margin:
-    return _margin(mdp, weights, _seen(mdp, demonstration), values)
-
-
-def _seen(mdp: TabularMDP, demonstration: Demonstration) -> tuple[Evidence, Bool[Array, "n L"]]:
-    return evidence_of(mdp, Sensor(), demonstration), jnp.asarray(demonstration.kind) == SEEN
-
-
-def _margin(
-    mdp: TabularMDP, weights: Float[Array, " K"], observed: tuple, values: Float[Array, " S"] | None
-) -> Margin:
-    evidence, seen = observed
     plan = soft_plan(mdp, reward_of(mdp, weights), values)
     completed = complete(mdp, smooth_all(mdp, plan.log_policy, evidence), evidence.live, seen)
     statistic = FEATURES.of_session(mdp, plan, completed)
@@ -223,7 +203,7 @@ class _Settings(NamedTuple):
 def _session(
     mdp: TabularMDP, settings: _Settings, state: DarkoState, demonstration: Demonstration
 ) -> tuple[DarkoState, SessionInfo]:
-    observed = _seen(mdp, demonstration)
+    evidence, seen = evidence_of(mdp, Sensor(), demonstration), demonstration.kind == SEEN
     number = state.session + 1
     learning_rate = settings.learning_rate * number.astype(float) ** -settings.decay
 
@@ -234,7 +214,7 @@ def _session(
         inside = moved * jnp.where(length > settings.radius, settings.radius / length, 1.0)
         # Step zero only evaluates: one compiled margin serves the start, the steps and the end.
         weights = jnp.where(i > 0, inside, weights)
-        following = _margin(mdp, weights, observed, found.values)
+        following = feature_margin(mdp, weights, evidence, seen, found.values)
         return weights, following, jnp.where(i > 0, first, jnp.linalg.norm(following.margin))
 
     k, s = mdp.n_features, mdp.n_states

@@ -50,7 +50,7 @@ class SensorIdentification(NamedTuple):
     ------
     erratic : float ``[J]``
         Agreement of observations with truths if the expert is as erratic as learned.
-    decided : float ``[J]``
+    optimal : float ``[J]``
         Agreement if the expert always acts optimally under the learned reward.
     structure : Identification
         Predicates that no observation of this demonstration identifies, whatever the expert does.
@@ -59,14 +59,14 @@ class SensorIdentification(NamedTuple):
     """
 
     erratic: Float[np.ndarray, " J"]
-    decided: Float[np.ndarray, " J"]
+    optimal: Float[np.ndarray, " J"]
     structure: Identification
     tolerance: float
 
     @property
     def identified(self) -> Bool[np.ndarray, " J"]:
         """Marks of predicates whose agreement is known, up to the tolerance."""
-        known: Bool[np.ndarray, " J"] = np.abs(self.erratic - self.decided) <= self.tolerance
+        known: Bool[np.ndarray, " J"] = np.abs(self.erratic - self.optimal) <= self.tolerance
         known[list(self.structure.uninformative)] = False
         return known
 
@@ -74,7 +74,7 @@ class SensorIdentification(NamedTuple):
         """Describe the unidentified predicates in words; empty if all are identified."""
         called = [f"predicate {j}" if names is None else names[j] for j in range(len(self.erratic))]
         lines = [
-            f"{called[j]}: not identified; reports agree in {self.decided[j]:.0%} of cases if the expert "
+            f"{called[j]}: not identified; reports agree in {self.optimal[j]:.0%} of cases if the expert "
             f"always does what is best, in {self.erratic[j]:.0%} if he errs as was learned"
             for j in np.flatnonzero(~self.identified)
             if j not in self.structure.uninformative
@@ -177,15 +177,15 @@ def sensor_identifier(
         session = prepare(mdp, classes, demonstration.bucketed(), perception.scored)
         reward = reward_of(mdp, jnp.asarray(w))
         best = deterministic_policy(hard_plan(mdp, reward).optimal)
-        decided = (1 - _ERRS) * best + _ERRS * slips
+        optimal = (1 - _ERRS) * best + _ERRS * slips
         (erratic, likely), (sure, _) = (
-            fit(session, policy) for policy in (soft_plan(mdp, reward).log_policy, jnp.log(decided))
+            fit(session, policy) for policy in (soft_plan(mdp, reward).log_policy, jnp.log(optimal))
         )
         if not np.isfinite(likely).all():
             require_possible(FeatureNoise(psi, np.full(len(psi), 0.5), mask) * seen, mdp, demonstration)
             raise DemonstrationError("a trajectory has probability zero under the learned policy")
         # Uniform over the reachable truths: predicates that agree on all of them are not identified.
-        structure = unidentified_predicates(psi, np.asarray(decided), reportable)
+        structure = unidentified_predicates(psi, np.asarray(optimal), reportable)
         return SensorIdentification(np.asarray(erratic), np.asarray(sure), structure, tolerance)
 
     return identify
@@ -206,12 +206,12 @@ def _fit(
     def fit(
         session: PreparedSession, log_policy: Float[Array, "S A"]
     ) -> tuple[Float[Array, " J"], Float[Array, " n"]]:
-        confidence = perception.confidence(perception.empty, session.reports)
+        confidence = perception.confidence(perception.empty, session.observations)
 
         def step(_: int, carry: tuple) -> tuple:
             logits = carry[0]
             evidence = report_log_evidence(
-                perception.classes, logits, session.reports, confidence, visibility
+                perception.classes, logits, session.observations, confidence, visibility
             )
             completion = smooth_all(mdp, log_policy, Evidence(evidence, session.live))
             heard = perception.summarise(logits, session, confidence, completion.pairs)

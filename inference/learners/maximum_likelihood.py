@@ -27,8 +27,7 @@ from ..mixtures.clustering import Clustering
 from .boltzmann import (
     BOX,
     ETA,
-    boltzmann_log_policy,
-    count_log_likelihoods,
+    boltzmann_log_likelihoods,
     random_weights,
     require_positive,
     visit_counts,
@@ -84,7 +83,7 @@ def ascend(
 
     @jax.value_and_grad
     def objective(weights: Float[Array, " K"]) -> Float[Array, ""]:
-        return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, rationality), counts[None])[0]
+        return boltzmann_log_likelihoods(mdp, weights, counts[None], rationality)[0]
 
     def reach(point: Ascent) -> Float[Array, ""]:
         return point.step * jnp.max(jnp.abs(point.gradient))
@@ -236,7 +235,7 @@ def component_log_likelihoods(
     """Return the log-likelihood of every trajectory under every component's weights; traceable."""
 
     def one(theta: Float[Array, " K"]) -> Float[Array, " n"]:
-        return count_log_likelihoods(mdp, boltzmann_log_policy(mdp, theta, rationality), counts)
+        return boltzmann_log_likelihoods(mdp, theta, counts, rationality)
 
     return lax.map(one, weights).T
 

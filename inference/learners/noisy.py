@@ -87,7 +87,7 @@ class RIMEOState(NamedTuple):
         Soft values of ``weights``, planning's warm start.
     logits : float ``[J]``
         Logits of the reliabilities ``P*``.
-    reports : ReportStatistic or FrequencyStatistic
+    observation_statistic : ReportStatistic or FrequencyStatistic
         Statistic of the observations.
     program : tuple
         Warm starts of solvers outside JAX.
@@ -99,7 +99,7 @@ class RIMEOState(NamedTuple):
     statistic: Any
     values: Float[Array, " S"]
     logits: Float[Array, " J"]
-    reports: Any
+    observation_statistic: Any
     program: Any
     session: Int[Array, ""]
     key: Array
@@ -497,7 +497,7 @@ class _Point(NamedTuple):
 class _Expected(NamedTuple):
     """Targets of both programs, and further arguments of the M-step."""
 
-    reports: Any
+    observation_statistic: Any
     working: Any
     values: Float[Array, " S"]
     gradient: Float[Array, ""]
@@ -513,7 +513,7 @@ class _Alternation(NamedTuple):
 
     def prepare(self, state: RIMEOState, demonstration: Any) -> tuple[PreparedSession, Array]:
         session = prepare(self.method.mdp, self.perception.classes, demonstration, self.perception.scored)
-        return session, self.perception.confidence(state.reports, session.reports)
+        return session, self.perception.confidence(state.observation_statistic, session.observations)
 
     def first(self, state: RIMEOState) -> _Point:
         zero, far = jnp.zeros((), int), jnp.array(jnp.inf)
@@ -526,10 +526,10 @@ class _Alternation(NamedTuple):
     ) -> tuple[Any, Any]:
         """Complete the demonstration and its observations under a plan and reliabilities."""
         evidence = report_log_evidence(
-            self.perception.classes, logits, session.reports, confidence, self.method.sensor.visibility
+            self.perception.classes, logits, session.observations, confidence, self.method.sensor.visibility
         )
         posterior = smooth_all(self.method.mdp, plan.log_policy, Evidence(evidence, session.live))
-        completed = complete(self.method.mdp, posterior, session.live, session.reports.seen)
+        completed = complete(self.method.mdp, posterior, session.live, session.observations.seen)
         return completed, self.perception.summarise(logits, session, confidence, posterior.pairs)
 
     def expect(
@@ -538,20 +538,20 @@ class _Alternation(NamedTuple):
         """Run the E-step."""
         mdp, statistic = self.method.mdp, self.method.statistic
         plan = self.method.plan(point.weights, point.values)
-        completed, reports = self.complete(session, confidence, plan, point.logits)
+        completed, observed = self.complete(session, confidence, plan, point.logits)
         working = blend(state.statistic, statistic.of_session(mdp, plan, completed), self.forgetting)
         gradient = lax.cond(
             point.iterations == 0,
             lambda: self.method.gradient(plan, working),
             lambda: point.gradient,
         )
-        heard = self.perception.blend(state.reports, reports)
+        heard = self.perception.blend(state.observation_statistic, observed)
         own = jnp.sum(completed.expectations.log_likelihood)
         return _Expected(heard, working, plan.values, gradient, own)
 
     def advance(self, point: _Point, expected: _Expected, logits: Array, solution: Any) -> _Point:
         """Return the point after both M-steps."""
-        agreement = self.perception.agreement(logits, expected.reports)
+        agreement = self.perception.agreement(logits, expected.observation_statistic)
         # Before the first observation no agreement can move.
         moved = jnp.max(jnp.where(jnp.isnan(agreement), 0.0, jnp.abs(agreement - point.agreement)))
         weights = jnp.asarray(solution.weights)
@@ -573,12 +573,12 @@ class _Alternation(NamedTuple):
         """End a session: complete it once more, under its own result, and update the statistics."""
         mdp, statistic = self.method.mdp, self.method.statistic
         plan = self.method.plan(point.weights, point.values)
-        completed, reports = self.complete(session, confidence, plan, point.logits)
+        completed, observed = self.complete(session, confidence, plan, point.logits)
         own = jnp.sum(completed.expectations.log_likelihood)
         kept = blend(state.statistic, statistic.to_keep(mdp, plan, completed), self.forgetting)
-        heard = self.perception.blend(state.reports, reports)
+        heard = self.perception.blend(state.observation_statistic, observed)
         number = state.session + 1
-        report: dict[str, Any] = {
+        info: dict[str, Any] = {
             "session": number,
             "log_likelihood": statistic.log_likelihood(mdp, point.weights, plan.values, kept),
             "demonstration_log_likelihood": own,
@@ -597,7 +597,7 @@ class _Alternation(NamedTuple):
         # Keep the previous state if the observation has probability zero; compiled fleets cannot raise.
         possible = jnp.isfinite(own)
         spared = state._replace(program=program)
-        return jax.tree.map(partial(jnp.where, possible), learned, spared), RIMEOInfo(**report)
+        return jax.tree.map(partial(jnp.where, possible), learned, spared), RIMEOInfo(**info)
 
 
 class _Sensing(NamedTuple):
@@ -635,7 +635,9 @@ def _learner(
             slack, ridge = method.penalties(expected.working, state.session + 1)
             start = WarmStart(point.weights, expected.values)
             solution = newton(mdp, expected.working, slack, ridge, start)
-            return parts.advance(point, expected, perception.fit(expected.reports, point.logits), solution)
+            return parts.advance(
+                point, expected, perception.fit(expected.observation_statistic, point.logits), solution
+            )
 
         def unfinished(point: _Point) -> Array:
             return (point.change > tolerance) & (point.iterations < iterations)
@@ -672,12 +674,12 @@ def _learner(
         require_slack_in(method.slack, int(state.session) + 1)
         heard = state
         if perception.hear is not None:
-            heard = state._replace(reports=perception.hear(state.reports, seen))
-        new, report = run(heard, demonstration.bucketed())
-        if not np.isfinite(report.demonstration_log_likelihood):
+            heard = state._replace(observation_statistic=perception.hear(state.observation_statistic, seen))
+        new, info = run(heard, demonstration.bucketed())
+        if not np.isfinite(info.demonstration_log_likelihood):
             require_possible(reporting * method.sensor, mdp, seen)
             raise DemonstrationError("a trajectory has probability zero under the current policy")
-        return new, in_plain_numbers(report, time.perf_counter() - began)
+        return new, in_plain_numbers(info, time.perf_counter() - began)
 
     @jax.jit
     def likelihood(state: RIMEOState, weights: Float[Array, " K"]) -> Float[Array, ""]:
@@ -719,15 +721,15 @@ def _outside(
                 break
             slack, ridge = method.penalties(expected.working, state.session + 1)
             solution, rewards = solve(expected.working, slack, ridge, rewards)
-            if perception.fit_outside is not None and expected.reports.size > 0:
-                logits, sensor = perception.fit_outside(expected.reports, sensor)
+            if perception.fit_outside is not None and expected.observation_statistic.size > 0:
+                logits, sensor = perception.fit_outside(expected.observation_statistic, sensor)
             else:
-                logits = perception.fit(expected.reports, point.logits)
+                logits = perception.fit(expected.observation_statistic, point.logits)
             reward = WarmStart(jnp.asarray(solution.weights), jnp.asarray(solution.values))
             counted = jnp.asarray(solution.iterations), jnp.asarray(solution.converged)
             point = advance(point, expected, logits, _Solved(*reward, *counted))
-        new, report = closing(state, prepared, confidence, point, ())
-        return new._replace(program=(rewards, sensor)), report
+        new, info = closing(state, prepared, confidence, point, ())
+        return new._replace(program=(rewards, sensor)), info
 
     return run, (empty, IpoptPoint(np.zeros(0), np.zeros(0), np.zeros(0)))
 

@@ -29,8 +29,7 @@ from ...version import __version__
 from ..learners.boltzmann import (
     BOX,
     ETA,
-    boltzmann_log_policy,
-    count_log_likelihoods,
+    boltzmann_log_likelihoods,
     random_weights,
     reflected,
     require_positive,
@@ -89,7 +88,7 @@ def _walk(
     chains, warmup, draws = lengths
 
     def evaluate(weights: Float[Array, " K"]) -> tuple:
-        each = count_log_likelihoods(mdp, boltzmann_log_policy(mdp, weights, rationality), counts)
+        each = boltzmann_log_likelihoods(mdp, weights, counts, rationality)
         if prior is None:
             return each, jnp.sum(each)
         # Densities are evaluated inside their support only: outside, many return a number all the same.

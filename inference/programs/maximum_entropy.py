@@ -142,10 +142,13 @@ def solve_dual(
     >>> from i2rl.domains import five_cells
     >>> from i2rl.inference import solve_dual
     >>> from i2rl.inference.programs.constraints import FeatureTarget
+    >>> from i2rl.inference.programs.maximum_entropy import require_converged
     >>> from i2rl.models import feature_expectations, reward_of, soft_plan
     >>> mdp, weights, *_ = five_cells()
-    >>> target = feature_expectations(mdp, soft_plan(mdp, reward_of(mdp, weights)).policy)
-    >>> print(solve_dual(mdp, FeatureTarget(target, mdp.initial)).weights.round(2))  # those of the expert
+    >>> policy = soft_plan(mdp, reward_of(mdp, weights)).policy
+    >>> target = FeatureTarget(feature_expectations(mdp, policy), mdp.initial)
+    >>> solution = require_converged(mdp, target, 0.0, solve_dual(mdp, target))
+    >>> print(solution.weights.round(2))  # those of the expert
     [ 2.  -0.2]
     """
     require_discounted(mdp)

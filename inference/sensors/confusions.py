@@ -27,7 +27,7 @@ class ConfusionNoise(Protocol):
     def noise(self) -> ObservationModel:
         """The observation model."""
 
-    def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
+    def confused(self, truth: Int[Array, " n"], observation: Int[Array, " n"]) -> Bool[Array, "n M"]:
         """Mark the confusion that turned each truth into its observation (flat indices)."""
 
     def _replace(self, *, chances: Array = ...) -> Any:
@@ -55,9 +55,9 @@ def confusion_counts(
     size = n_states * n_actions
     acts = noise.acts.reshape(-1, size).astype(float)
     believed = pairs.reshape(-1, size) * seen.reshape(-1, 1)
-    report = jnp.where(seen, state * n_actions + action, 0).reshape(-1)
-    turned = noise.confused(jnp.tile(jnp.arange(size), len(report)), jnp.repeat(report, size))
-    turned = turned.reshape(len(report), size, -1).astype(float)
+    observation = jnp.where(seen, state * n_actions + action, 0).reshape(-1)
+    turned = noise.confused(jnp.tile(jnp.arange(size), len(observation)), jnp.repeat(observation, size))
+    turned = turned.reshape(len(observation), size, -1).astype(float)
     happened = jnp.einsum("tg,tgm,mg->m", believed, turned, acts)
     return ConfusionStatistic(happened, jnp.einsum("tg,mg->m", believed, acts))
 

@@ -200,35 +200,35 @@ def _terms(classes: ReportClasses, logits: Float[Array, " J"]) -> _Terms:
 
 
 def _reported(
-    classes: ReportClasses, reports: SessionReports, by_pattern: Float[Array, " E"]
+    classes: ReportClasses, observations: SessionReports, by_pattern: Float[Array, " E"]
 ) -> Float[Array, "n L C"]:
     """Compute ``sum_o said_o f(agreement of g and o)`` of every step, for truths ``g`` in each class."""
 
     def named() -> Array:
-        at = classes.pattern[jnp.argmax(reports.said, axis=2)]
-        return jnp.where(reports.whole[..., None], by_pattern[at], 0.0)
+        at = classes.pattern[jnp.argmax(observations.said, axis=2)]
+        return jnp.where(observations.whole[..., None], by_pattern[at], 0.0)
 
-    return lax.cond(reports.open, lambda: reports.said @ by_pattern[classes.pattern], named)
+    return lax.cond(observations.open, lambda: observations.said @ by_pattern[classes.pattern], named)
 
 
 def _by_pattern(
-    classes: ReportClasses, reports: SessionReports, weights: Float[Array, "n L C"]
+    classes: ReportClasses, observations: SessionReports, weights: Float[Array, "n L C"]
 ) -> Float[Array, " E"]:
     """Sum weights of truths over each pattern: the transpose of :func:`_reported`."""
     zero = jnp.zeros(len(classes.patterns))
 
     def named() -> Array:
-        at = classes.pattern[jnp.argmax(reports.said, axis=2)]
-        return zero.at[at].add(jnp.where(reports.whole[..., None], weights, 0.0))
+        at = classes.pattern[jnp.argmax(observations.said, axis=2)]
+        return zero.at[at].add(jnp.where(observations.whole[..., None], weights, 0.0))
 
     def sets() -> Array:
-        return zero.at[classes.pattern].add(jnp.einsum("nlc,nlo->co", weights, reports.said))
+        return zero.at[classes.pattern].add(jnp.einsum("nlc,nlo->co", weights, observations.said))
 
-    return lax.cond(reports.open, sets, named)
+    return lax.cond(observations.open, sets, named)
 
 
 class _Likelihood(NamedTuple):
-    """``P(report | g)`` of every step, and its parts: ``right + wrong`` if scored, else ``plain``."""
+    """``P(observation | g)`` of every step, and its parts: ``right + wrong`` if scored, else ``plain``."""
 
     plain: Float[Array, "n L C"]
     right: Float[Array, "n L S A"]
@@ -239,15 +239,15 @@ class _Likelihood(NamedTuple):
 
 
 def _likelihood(
-    classes: ReportClasses, terms: _Terms, reports: SessionReports, confidence: Float[Array, "... S A"]
+    classes: ReportClasses, terms: _Terms, observations: SessionReports, confidence: Float[Array, "... S A"]
 ) -> _Likelihood:
     """Evaluate every step and truth; ``confidence`` is that of an observation, NaN without scores."""
-    scored = jnp.broadcast_to(~jnp.isnan(confidence), reports.same.shape)
+    scored = jnp.broadcast_to(~jnp.isnan(confidence), observations.same.shape)
     c = jnp.where(jnp.isnan(classes.certain), jnp.where(scored, confidence, 0.0), classes.certain)
-    reported = _reported(classes, reports, terms.by_pattern)
+    reported = _reported(classes, observations, terms.by_pattern)
     plain = reported / terms.total
-    others = reported[..., classes.of_pair] - reports.same * terms.itself
-    right = c * reports.same
+    others = reported[..., classes.of_pair] - observations.same * terms.itself
+    right = c * observations.same
     wrong = (1 - c) * jnp.maximum(others * (terms.possible / terms.others)[classes.of_pair], 0.0)
     return _Likelihood(
         plain, right, wrong, c, scored, jnp.where(scored, right + wrong, plain[..., classes.of_pair])
@@ -257,7 +257,7 @@ def _likelihood(
 def report_log_evidence(
     classes: ReportClasses,
     logits: Float[Array, " J"],
-    reports: SessionReports,
+    observations: SessionReports,
     confidence: Float[Array, "... S A"],
     visibility: Float[Array, " S"] | None = None,
 ) -> Float[Array, "n L S A"]:
@@ -265,17 +265,17 @@ def report_log_evidence(
 
     Parameters
     ----------
-    classes, logits, reports
+    classes, logits, observations
     confidence : float ``[S, A]`` or ``[n, L, S, A]``
         Probability that the observation is right if the truth is ``(s, a)``; NaN without scores. For a truth
         that cannot be reported it is zero, whatever the argument.
     visibility : float ``[S]``, optional
         Probability of being in view; one by default.
     """
-    total = _likelihood(classes, _terms(classes, logits), reports, confidence).total
+    total = _likelihood(classes, _terms(classes, logits), observations, confidence).total
     noise = jnp.where(total > 0, jnp.log(jnp.where(total > 0, total, 1.0)), -jnp.inf)
     view = jnp.ones(classes.of_pair.shape[0]) if visibility is None else visibility
-    kind = reports.kind[..., None, None]
+    kind = observations.kind[..., None, None]
     seen, hidden = jnp.log(view)[:, None], jnp.log1p(-view)[:, None]
     return jnp.where(kind == SEEN, noise + seen, jnp.where(kind == HIDDEN, hidden, 0.0))
 
@@ -330,26 +330,26 @@ def no_reports(classes: ReportClasses) -> ReportStatistic:
     return ReportStatistic(zero, by_class, by_class, zero, matches, pairs, pairs)
 
 
-def score_statistic(reports: SessionReports) -> tuple[Float[Array, "S A"], Float[Array, "S A"]]:
+def score_statistic(observations: SessionReports) -> tuple[Float[Array, "S A"], Float[Array, "S A"]]:
     """Return sum and number of scores by observed pair; observations with hidden coordinates are left out."""
-    counts = reports.whole & ~jnp.isnan(reports.score)
-    weight = jnp.where(counts, reports.score, 0.0)
-    return jnp.einsum("nl,nlsa->sa", weight, reports.same.astype(float)), jnp.einsum(
-        "nl,nlsa->sa", counts.astype(float), reports.same.astype(float)
+    counts = observations.whole & ~jnp.isnan(observations.score)
+    weight = jnp.where(counts, observations.score, 0.0)
+    return jnp.einsum("nl,nlsa->sa", weight, observations.same.astype(float)), jnp.einsum(
+        "nl,nlsa->sa", counts.astype(float), observations.same.astype(float)
     )
 
 
 def report_statistic(
     classes: ReportClasses,
     logits: Float[Array, " J"],
-    reports: SessionReports,
+    observations: SessionReports,
     confidence: Float[Array, "... S A"],
     pairs: Float[Array, "n L S A"],
 ) -> ReportStatistic:
     """Summarise a session's observations under a posterior ``pairs`` over truths."""
     terms = _terms(classes, logits)
-    parts = _likelihood(classes, terms, reports, confidence)
-    mass = pairs * reports.seen[..., None, None]
+    parts = _likelihood(classes, terms, observations, confidence)
+    mass = pairs * observations.seen[..., None, None]
     plain = jnp.where(parts.plain > 0, classes.gather(jnp.where(parts.scored, 0.0, mass)), 0.0)
     possible = parts.scored & (parts.total > 0)
     share = jnp.where(possible, mass / jnp.where(possible, parts.total, 1.0), 0.0)
@@ -357,19 +357,19 @@ def report_statistic(
     # Wrong observations: all pairs that the observation may be, less the truth itself.
     blame = share * (1 - parts.confidence) * (terms.possible / terms.others)[classes.of_pair]
     rate = plain / jnp.where(parts.plain > 0, parts.plain * terms.total, 1.0)
-    agreed = _by_pattern(classes, reports, rate + classes.gather(blame))
-    agreed = (agreed - classes.itself * jnp.sum(blame * reports.same)) * terms.by_pattern
-    size = jnp.sum(reports.seen).astype(float)
-    per_report = 1 / jnp.maximum(size, 1.0)
-    scores, scored = score_statistic(reports)
+    agreed = _by_pattern(classes, observations, rate + classes.gather(blame))
+    agreed = (agreed - classes.itself * jnp.sum(blame * observations.same)) * terms.by_pattern
+    size = jnp.sum(observations.seen).astype(float)
+    per_observation = 1 / jnp.maximum(size, 1.0)
+    scores, scored = score_statistic(observations)
     return ReportStatistic(
         size,
-        plain.sum((0, 1)) * per_report,
-        wrong * per_report,
-        jnp.sum(share * parts.right) * per_report,
-        jnp.maximum(agreed, 0.0) @ classes.patterns * per_report,
-        scores * per_report,
-        scored * per_report,
+        plain.sum((0, 1)) * per_observation,
+        wrong * per_observation,
+        jnp.sum(share * parts.right) * per_observation,
+        jnp.maximum(agreed, 0.0) @ classes.patterns * per_observation,
+        scores * per_observation,
+        scored * per_observation,
     )
 
 

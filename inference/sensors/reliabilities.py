@@ -67,14 +67,14 @@ class PreparedSession(NamedTuple):
 
     Fields
     ------
-    reports : SessionReports
+    observations : SessionReports
     live : bool ``[n, L]``
         Marks of existing steps.
     truth : float ``[n, L, S, A]`` or None
         A point at the true pair, if it is known.
     """
 
-    reports: SessionReports
+    observations: SessionReports
     live: Bool[Array, "n L"]
     truth: Float[Array, "n L S A"] | None
 
@@ -116,7 +116,7 @@ class Perception(NamedTuple):
         Start: the current logits.
     agreement : ``(logits, statistic) -> [J]``
         Learned frequency with which an observation's predicate is that of the truth.
-    confidence : ``(kept, reports) -> [S, A] or [n, L, S, A]``
+    confidence : ``(kept, observations) -> [S, A] or [n, L, S, A]``
         Probability that an observation of each pair is right; NaN without scores.
     fit_outside : ``(statistic, warm) -> (logits, warm)``, or None
         The same fit by a solver outside JAX.
@@ -153,12 +153,12 @@ def entropic_perception(
         logits: Array, session: PreparedSession, confidence: Array, pairs: Array
     ) -> ReportStatistic:
         if completion == "observed":
-            same = session.reports.same.astype(float)
+            same = session.observations.same.astype(float)
             pairs = same / jnp.maximum(same.sum((2, 3), keepdims=True), 1.0)
         elif completion == "oracle":
             assert session.truth is not None
             pairs = session.truth
-        return report_statistic(classes, logits, session.reports, confidence, pairs)
+        return report_statistic(classes, logits, session.observations, confidence, pairs)
 
     def slack(statistic: ReportStatistic) -> Array:
         return observation_slack / jnp.maximum(statistic.size, 1.0)
@@ -185,12 +185,12 @@ def entropic_perception(
         )
         return jnp.asarray(solution.logits), solution.warm
 
-    def confidence(kept: ReportStatistic, reports: SessionReports) -> Array:
+    def confidence(kept: ReportStatistic, observations: SessionReports) -> Array:
         if scores == "stepwise":
-            return reports.score[..., None, None]
+            return observations.score[..., None, None]
         if scores == "none":
             return jnp.full((1, 1), jnp.nan)
-        sums, numbers = score_statistic(reports)
+        sums, numbers = score_statistic(observations)
         total, number = kept.scores * kept.size + sums, kept.scored * kept.size + numbers
         return jnp.where(number > 0, total / jnp.where(number > 0, number, 1.0), jnp.nan)
 
@@ -226,7 +226,7 @@ class FrequencyStatistic(NamedTuple):
     share: Float[Array, " J"]
 
 
-def _no_confidence(kept: FrequencyStatistic, reports: SessionReports) -> Array:
+def _no_confidence(kept: FrequencyStatistic, observations: SessionReports) -> Array:
     return jnp.full((1, 1), jnp.nan)
 
 
@@ -240,7 +240,7 @@ def counted_perception(classes: ReportClasses, predicates: Bool[np.ndarray, "J S
     def summarise(
         logits: Array, session: PreparedSession, confidence: Array, pairs: Array
     ) -> FrequencyStatistic:
-        seen, score = session.reports.seen, session.reports.score
+        seen, score = session.observations.seen, session.observations.score
         size = jnp.sum(seen).astype(float)
         trusted = jnp.sum(jnp.where(seen, jnp.where(jnp.isnan(score), 1.0, score), 0.0))
         return FrequencyStatistic(size, jnp.full(n_predicates, trusted / jnp.maximum(size, 1.0)))
@@ -272,10 +272,10 @@ def coded_perception(classes: ReportClasses, predicates: Bool[np.ndarray, "J S A
     def summarise(
         logits: Array, session: PreparedSession, confidence: Array, pairs: Array
     ) -> FrequencyStatistic:
-        length = session.reports.kind.shape[1]
-        order = jnp.where(session.reports.whole, jnp.arange(length), -1)
+        length = session.observations.kind.shape[1]
+        order = jnp.where(session.observations.whole, jnp.arange(length), -1)
         last = (order == order.max(1, keepdims=True)) & (order >= 0)
-        true = jnp.einsum("nl,nlsa,jsa->j", last.astype(float), session.reports.same.astype(float), psi)
+        true = jnp.einsum("nl,nlsa,jsa->j", last.astype(float), session.observations.same.astype(float), psi)
         credit = true + _CODED_COUNT
         return FrequencyStatistic(jnp.ones(()), credit / (jnp.sum(credit) + len(psi) * _CODED_COUNT))
 

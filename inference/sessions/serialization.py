@@ -37,6 +37,8 @@ _LARGEST_SIDE = 1 << 40
 _MOST_AXES = 32
 _KEY = "key:"
 _KINDS = ("none", "text", "python", "scalar", "numpy", "jax")
+# First parts of the names of leaves stored by earlier versions, and the present ones.
+_FORMER = {"reports": "observation_statistic"}
 
 
 class Leaf(NamedTuple):
@@ -213,10 +215,11 @@ def restore(leaves: Mapping[str, Leaf], template: Any) -> Any:
     A leaf must have the template's type and shape, with exceptions for parts that exist only after the first
     session: a None in the template accepts any leaf; an array without elements accepts any shape of its type,
     or None. A Python number in the template accepts any width of its kind, and a random key keeps its stored
-    implementation; a legacy key (two integers) becomes the typed key with the same draws. Raises
-    ``ValueError`` naming the leaf that does not fit.
+    implementation; a legacy key (two integers) becomes the typed key with the same draws. Leaves of fields
+    that were renamed keep their place. Raises ``ValueError`` naming the leaf that does not fit.
     """
     expected, structure = _flatten(template)
+    leaves = {name if name in expected else _renamed(name): leaf for name, leaf in leaves.items()}
     if list(expected) != list(leaves):
         missing = [name for name in expected if name not in leaves]
         unknown = [name for name in leaves if name not in expected]
@@ -230,6 +233,12 @@ def restore(leaves: Mapping[str, Leaf], template: Any) -> Any:
             raise ValueError(f"{name or 'the tree'} is stored as {stored} where {likes[name]} is expected")
     revived = [_revived(name, leaf, likes[name]) for name, leaf in leaves.items()]
     return jax.tree_util.tree_unflatten(structure, revived)
+
+
+def _renamed(name: str) -> str:
+    """Return the present name of a leaf stored by an earlier version."""
+    first, dot, rest = name.partition(".")
+    return _FORMER.get(first, first) + dot + rest
 
 
 def _flatten(tree: Any) -> tuple[dict[str, Any], Any]:

@@ -160,7 +160,28 @@ def sample_observation_features(
         ``posterior``: ``reliability``, ``agreement (chain, draw, predicate)``; ``sample_stats``;
         ``observed_data``: ``matches``, ``score``.
 
-    Raises ``ValueError`` as the model does, and for numbers of draws or chains below one.
+    Raises
+    ------
+    ValueError
+        As the model does, and for numbers of draws or chains below one.
+
+    See Also
+    --------
+    i2rl.models.observation_feature_model : the model
+    i2rl.models.reported_matches : its data
+    i2rl.inference.rimeo : learns reliabilities and reward together, without labels
+
+    Examples
+    --------
+    >>> import jax
+    >>> import numpy as np
+    >>> from i2rl.models import reported_matches, sample_observation_features
+    >>> at_end, ends = np.indices((5, 3))[:1] == 4, np.eye(15).reshape(-1, 5, 3)[[12] * 30]
+    >>> matches = reported_matches(at_end, [4] * 27 + [3] * 3, [0] * 30, ends)  # 27 of 30 are right
+    >>> sizes = {"draws": 100, "warmup": 100, "chains": 1}
+    >>> posterior = sample_observation_features(jax.random.key(0), at_end, matches, **sizes).posterior
+    >>> round(float(posterior.agreement.mean()), 1)
+    0.9
     """
     key = as_key(key)
     for name, number in (("draws", draws), ("warmup", warmup), ("chains", chains)):

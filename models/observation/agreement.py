@@ -124,8 +124,25 @@ def reported_matches(
         Posterior over the pair behind each observation. A point at the true pair gives the ``oracle`` of
         the sources, a point at the observation gives ``observed``.
 
-    Raises ``ValueError`` for bad predicates, shapes that do not fit, indices out of range, or a posterior
-    whose rows do not sum to one.
+    Raises
+    ------
+    ValueError
+        For bad predicates, shapes that do not fit, indices out of range, or a posterior whose rows do not sum
+        to one.
+
+    See Also
+    --------
+    i2rl.models.sample_observation_features : the posterior of the reliabilities behind them
+    i2rl.inference.ObservationProgram : the maximum-entropy reliabilities
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from i2rl.models import reported_matches
+    >>> predicates = np.indices((5, 3))  # the cell and the action of each pair
+    >>> truths = np.eye(15).reshape(-1, 5, 3)[[0, 4]]  # (0, 0) and (1, 1)
+    >>> reported_matches(predicates, [0, 2], [0, 1], truths).agreement
+    array([0.5, 1. ])
     """
     psi, truth = checked_predicates(predicates), np.asarray(posterior, float)
     s, a = np.asarray(states), np.asarray(actions)

@@ -14,7 +14,7 @@ from .evidence import AnySensor, ObservationModel, Sensor
 
 
 class _ConfusionFields(NamedTuple):
-    reports: Int[Array, "M S A"]
+    observations: Int[Array, "M S A"]
     chances: Float[Array, " M"]
 
 
@@ -27,7 +27,7 @@ class Confusions(_ConfusionFields):
 
     Parameters
     ----------
-    reports : int ``[M, S, A]``
+    observations : int ``[M, S, A]``
         The pair that each confusion reports, as the flat index ``s * A + a``; the pair itself where the
         confusion does not act. At most one confusion acts on a pair.
     chances : float ``[M]``
@@ -41,9 +41,9 @@ class Confusions(_ConfusionFields):
 
     __slots__ = ()
 
-    def __new__(cls, reports: np.ndarray | Array, chances: np.ndarray | Array) -> Confusions:
+    def __new__(cls, observations: np.ndarray | Array, chances: np.ndarray | Array) -> Confusions:
         """Check and convert; see the class."""
-        flat = jnp.asarray(reports if is_traced(reports) else _checked(np.asarray(reports)))
+        flat = jnp.asarray(observations if is_traced(observations) else _checked(np.asarray(observations)))
         p = concrete("chances", chances)
         if p is not None:
             if p.shape != flat.shape[:1]:
@@ -56,11 +56,12 @@ class Confusions(_ConfusionFields):
     def of_actions(
         n_states: int, pairs: list[tuple[int, int]], chances: np.ndarray, n_actions: int
     ) -> Confusions:
-        """Build confusions ``(truth, report)`` of actions in every state; ``chances`` has one entry each."""
-        reports = np.tile(np.arange(n_states * n_actions).reshape(n_states, n_actions), (len(pairs), 1, 1))
-        for m, (truth, report) in enumerate(pairs):
-            reports[m, :, truth] = reports[m, :, report]
-        return Confusions(reports, np.asarray(chances, float))
+        """Build confusions ``(truth, observation)`` of actions in every state, each with its chance."""
+        itself = np.arange(n_states * n_actions).reshape(n_states, n_actions)
+        observations = np.tile(itself, (len(pairs), 1, 1))
+        for m, (truth, observation) in enumerate(pairs):
+            observations[m, :, truth] = itself[:, observation]
+        return Confusions(observations, np.asarray(chances, float))
 
     def __mul__(self, other: AnySensor) -> Sensor:  # type: ignore[override]
         """Compose with another sensor, such as a :class:`Visibility`."""
@@ -74,35 +75,35 @@ class Confusions(_ConfusionFields):
     @property
     def acts(self) -> Bool[Array, "M S A"]:
         """Marks of the pairs on which each confusion acts."""
-        return self.reports != jnp.arange(self.reports[0].size).reshape(self.reports.shape[1:])
+        return self.observations != jnp.arange(self.observations[0].size).reshape(self.observations.shape[1:])
 
     @property
     def noise(self) -> ObservationModel:
-        """``O(o | g)``: the probability of the confusion at its report, the rest at the pair itself."""
-        shape, size = self.reports.shape[1:], self.reports[0].size
+        """``O(o | g)``: the probability of the confusion at its observation, the rest at the pair itself."""
+        shape, size = self.observations.shape[1:], self.observations[0].size
         chance = jnp.where(self.acts, self.chances[:, None, None], 0.0).reshape(len(self.chances), size)
         g = jnp.arange(size)
         table = jnp.zeros((size, size)).at[g, g].add(1 - chance.sum(0))
-        table = table.at[g, self.reports.reshape(-1, size)].add(chance)
+        table = table.at[g, self.observations.reshape(-1, size)].add(chance)
         return ObservationModel._make((jnp.log(table).reshape(*shape, *shape),))
 
-    def confused(self, truth: Int[Array, " n"], report: Int[Array, " n"]) -> Bool[Array, "n M"]:
+    def confused(self, truth: Int[Array, " n"], observation: Int[Array, " n"]) -> Bool[Array, "n M"]:
         """Mark the confusion that turned each hidden pair into its observation (flat indices), if any did."""
-        flat = self.reports.reshape(len(self.chances), -1)[:, truth]
-        return ((flat == report) & (flat != truth)).T
+        flat = self.observations.reshape(len(self.chances), -1)[:, truth]
+        return ((flat == observation) & (flat != truth)).T
 
 
-def _checked(reports: np.ndarray) -> Int[np.ndarray, "M S A"]:
-    if reports.ndim != 3 or not reports.size or not np.issubdtype(reports.dtype, np.integer):
+def _checked(pairs: np.ndarray) -> Int[np.ndarray, "M S A"]:
+    if pairs.ndim != 3 or not pairs.size or not np.issubdtype(pairs.dtype, np.integer):
         raise ValueError(
-            f"confusions are whole numbers of shape [M, S, A], got {reports.dtype} of {list(reports.shape)}"
+            f"confusions are whole numbers of shape [M, S, A], got {pairs.dtype} of {list(pairs.shape)}"
         )
-    size = reports[0].size
-    if reports.min() < 0 or reports.max() >= size:
-        wrong = reports.min() if reports.min() < 0 else reports.max()
+    size = pairs[0].size
+    if pairs.min() < 0 or pairs.max() >= size:
+        wrong = pairs.min() if pairs.min() < 0 else pairs.max()
         raise ValueError(f"confusions name pairs by their flat index, 0 to {size - 1}; got {wrong}")
-    ways = (reports != np.arange(size).reshape(reports.shape[1:])).sum(0)
+    ways = (pairs != np.arange(size).reshape(pairs.shape[1:])).sum(0)
     if ways.max() > 1:
         s, a = np.argwhere(ways > 1)[0]
         raise ValueError(f"the pair ({s}, {a}) is confused in {ways[s, a]} ways; at most one is possible")
-    return reports
+    return pairs

@@ -362,20 +362,20 @@ def _fixed_point(
 
 
 def solve_values(
-    mdp: TabularMDP, policy: Float[Array, "S A"], rate: Float[Array, " S ..."]
+    mdp: TabularMDP, policy: Float[Array, "S A"], reward: Float[Array, " S ..."]
 ) -> Float[Array, " S ..."]:
-    """Solve ``x = rate + gamma P_pi x``: discounted sums of a per-state rate under a policy.
+    """Solve ``x = reward + gamma P_pi x``: discounted sums of a state's reward under a policy.
 
-    ``rate`` may carry trailing dimensions ``[S, K]``. Differentiable, forward and in reverse.
+    ``reward`` may carry trailing dimensions ``[S, K]``. Differentiable, forward and in reverse.
     Raises ``ValueError`` for discount 1.
     """
     require_discounted(mdp)
-    return _solve_values(mdp, policy, rate)
+    return _solve_values(mdp, policy, reward)
 
 
 @_compiled()
 def _solve_values(
-    mdp: TabularMDP, policy: Float[Array, "S A"], rate: Float[Array, " S ..."]
+    mdp: TabularMDP, policy: Float[Array, "S A"], reward: Float[Array, " S ..."]
 ) -> Float[Array, " S ..."]:
     fixed, fixed_policy = lax.stop_gradient((mdp, policy))
 
@@ -407,10 +407,10 @@ def _solve_values(
                 b,
             )
 
-        return lax.custom_linear_solve(matvec, rate, iterate, iterate_back)
+        return lax.custom_linear_solve(matvec, reward, iterate, iterate_back)
     factors = _factor(jnp.eye(mdp.n_states) - fixed.discount * fixed.state_transitions(fixed_policy))
     return lax.custom_linear_solve(
-        matvec, rate, lambda _, b: _solve_factored(factors, b), lambda _, b: _solve_transposed(factors, b)
+        matvec, reward, lambda _, b: _solve_factored(factors, b), lambda _, b: _solve_transposed(factors, b)
     )
 
 
@@ -545,7 +545,7 @@ def _occupancy(
 ) -> Float[Array, "S A"]:
     initial = mdp.initial if initial is None else jnp.asarray(initial, float)
     # The transpose of the linear map above; its derivative is the transposed solve.
-    _, pull = jax.vjp(lambda rate: _solve_values(mdp, policy, rate), jnp.zeros(mdp.n_states))
+    _, pull = jax.vjp(lambda reward: _solve_values(mdp, policy, reward), jnp.zeros(mdp.n_states))
     return pull(initial)[0][:, None] * policy
 
 
@@ -584,7 +584,8 @@ def feature_deviations(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Ar
     """Return standard deviations over trajectories of discounted features ``sum_t gamma^t phi_k(s_t, a_t)``.
 
     The result is exact: the second moment of a discounted sum obeys a Bellman equation with discount
-    ``gamma^2`` and rate ``phi^2 + 2 gamma phi E[mu(s')]`` (Sobel 1982). Raises ``ValueError`` for discount 1.
+    ``gamma^2`` and reward ``phi^2 + 2 gamma phi E[mu(s')]`` (Sobel 1982). Raises ``ValueError`` for
+    discount 1.
     """
     require_discounted(mdp)
     _require_numbers(mdp, "policy", policy)
@@ -595,9 +596,9 @@ def feature_deviations(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Ar
 def _feature_deviations(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array, " K"]:
     to_go = _features_to_go(mdp, policy)
     onward = jax.vmap(mdp.expect_next, in_axes=1, out_axes=2)(to_go)
-    rate = jnp.einsum("sa,sak->sk", policy, mdp.features * (mdp.features + 2 * mdp.discount * onward))
+    reward = jnp.einsum("sa,sak->sk", policy, mdp.features * (mdp.features + 2 * mdp.discount * onward))
     squared = replace(mdp, discount=mdp.discount**2)
-    second = mdp.initial @ _solve_values(squared, policy, rate)
+    second = mdp.initial @ _solve_values(squared, policy, reward)
     return jnp.sqrt(jnp.maximum(second - (mdp.initial @ to_go) ** 2, 0.0))
 
 

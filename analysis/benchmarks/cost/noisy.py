@@ -222,33 +222,33 @@ def part_seconds(task: NoisyTask, sessions: int = 20, replications: int = 200) -
         classes, "stepwise", "posterior", DEFAULT_OBSERVATION_SLACK, DEFAULT_FORGETTING
     )
     session = prepare(mdp, classes, one.bucketed(), True)
-    confidence = session.reports.score[..., None, None]
+    confidence = session.observations.score[..., None, None]
     plan = method.plan(state.weights, state.values)
-    evidence = report_log_evidence(classes, state.logits, session.reports, confidence)
+    evidence = report_log_evidence(classes, state.logits, session.observations, confidence)
     posterior = smooth_all(mdp, plan.log_policy, Evidence(evidence, session.live))
-    completed = complete(mdp, posterior, session.live, session.reports.seen)
-    told = report_statistic(classes, state.logits, session.reports, confidence, posterior.pairs)
-    heard = perception.blend(state.reports, told)
+    completed = complete(mdp, posterior, session.live, session.observations.seen)
+    told = report_statistic(classes, state.logits, session.observations, confidence, posterior.pairs)
+    heard = perception.blend(state.observation_statistic, told)
     working = blend(state.statistic, method.statistic.of_session(mdp, plan, completed), DEFAULT_FORGETTING)
     slack, ridge = method.penalties(working, state.session + 1)
     start = WarmStart(state.weights, plan.values)
     parts: dict[str, tuple[Callable[..., Any], tuple]] = {
         "planning": (method.plan, (state.weights, state.values)),
         "evidence": (
-            lambda logits, reports: report_log_evidence(
-                classes, logits, reports, reports.score[..., None, None]
+            lambda logits, observations: report_log_evidence(
+                classes, logits, observations, observations.score[..., None, None]
             ),
-            (state.logits, session.reports),
+            (state.logits, session.observations),
         ),
         "smoothing": (
             lambda log_policy, e: smooth_all(mdp, log_policy, Evidence(e, session.live)),
             (plan.log_policy, evidence),
         ),
         "statistic of observations": (
-            lambda logits, reports, pairs: report_statistic(
-                classes, logits, reports, reports.score[..., None, None], pairs
+            lambda logits, observations, pairs: report_statistic(
+                classes, logits, observations, observations.score[..., None, None], pairs
             ),
-            (state.logits, session.reports, posterior.pairs),
+            (state.logits, session.observations, posterior.pairs),
         ),
         "fit of the sensor": (perception.fit, (heard, state.logits)),
         "fit of the reward": (lambda x: newton(mdp, x, slack, ridge, start), (working,)),
@@ -269,10 +269,10 @@ def pattern_seconds(
     for number in predicates:
         stream = random_stream(size, number, 1)
         classes = report_classes(stream.predicates)
-        reports = session_reports(classes, stream.seen)
-        confidence, logits = reports.score[..., None, None], jnp.ones(number)
-        pairs = jnp.full(reports.same.shape, 1 / reports.same[0, 0].size)
-        told = report_statistic(classes, logits, reports, confidence, pairs)
+        observations = session_reports(classes, stream.seen)
+        confidence, logits = observations.score[..., None, None], jnp.ones(number)
+        pairs = jnp.full(observations.same.shape, 1 / observations.same[0, 0].size)
+        told = report_statistic(classes, logits, observations, confidence, pairs)
         fit = jax.jit(lambda x, logits: fit_sensor(classes, x, 0.05, logits))  # noqa: B023
         found[str(number)] = {
             "classes": len(classes.reportable),

@@ -126,7 +126,7 @@ def content(path: Path) -> Content:
                 record.session,
                 record.weights.tobytes(),
                 tuple(record.position),
-                [(k, np.asarray(v).tobytes()) for k, v in record.report.items() if k != "seconds"],
+                [(k, np.asarray(v).tobytes()) for k, v in record.info.items() if k != "seconds"],
             )
             for record in view.records()
         ]

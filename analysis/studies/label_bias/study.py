@@ -319,29 +319,11 @@ def _in_every_world(
     n: int,
 ) -> Trajectories:
     return lax.map(
-        lambda world: _drawn_and_scored(
+        lambda world: demonstrate_and_score(
             world[0], replace(world[1], discount=discount), weights, rationality, expert, steps, n
         ),
         (keys, mdps),
     )
-
-
-def demonstrate_and_score(
-    key: Array,
-    mdp: TabularMDP,
-    weights: Float[Array, " K"],
-    rationality: float,
-    *,
-    expert: str,
-    steps: int,
-    n: int,
-) -> Trajectories:
-    """Draw ``n`` trajectories of ``steps`` pairs from an expert and score them under both laws.
-
-    Boltzmann and optimal experts begin in a cell drawn from the initial distribution; where those of maximum
-    entropy begin is part of their law. Raises ``ValueError`` for another expert.
-    """
-    return _drawn_and_scored(key, _bare(mdp), weights, rationality, _expert_code(expert), steps, n)
 
 
 def _expert_code(expert: str) -> int:
@@ -351,7 +333,7 @@ def _expert_code(expert: str) -> int:
 
 
 @partial(jax.jit, static_argnames=("steps", "n"))
-def _drawn_and_scored(
+def demonstrate_and_score(
     key: Array,
     mdp: TabularMDP,
     weights: Float[Array, " K"],
@@ -360,6 +342,11 @@ def _drawn_and_scored(
     steps: int,
     n: int,
 ) -> Trajectories:
+    """Draw ``n`` trajectories of ``steps`` pairs from one of ``EXPERTS`` and score them under both laws.
+
+    Boltzmann and optimal experts begin in a cell drawn from the initial distribution; where those of maximum
+    entropy begin is part of their law.
+    """
     reward = reward_of(mdp, weights)
     law = finite_soft_plan(replace(mdp, discount=jnp.ones(())), reward, steps)
     values = optimal_action_values(mdp, weights)

@@ -399,7 +399,7 @@ def _doubted(task: NoisyTask, streams: Streams, result: MethodResult, scores: st
     n_predicates = len(task.predicates)
     erratic, optimal, identified = (
         np.array([getattr(x, name)[:n_predicates] for x in found])
-        for name in ("erratic", "decided", "identified")
+        for name in ("erratic", "optimal", "identified")
     )
     return SensorDoubt(erratic, optimal, identified)
 

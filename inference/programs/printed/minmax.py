@@ -161,7 +161,7 @@ def ascend_printed(
     space: TrajectorySpace,
     assignments: Float[np.ndarray, "n D"],
     gradient: AssignmentGradient = printed_assignment_gradient,
-    sweeps: int = 20,
+    iterations: int = 20,
     steps: int = 10,
     learning_rate: float = 0.01,
     ridge: float = 1e-2,
@@ -181,7 +181,7 @@ def ascend_printed(
     current = np.maximum(np.asarray(assignments, float), _LEAST_ASSIGNMENT)
     current = current / current.sum(1, keepdims=True)
     weights = np.zeros((current.shape[1], shown.shape[1]))
-    for _ in range(sweeps):
+    for _ in range(iterations):
         weights = np.stack([matched_weights(space, share, ridge) for share in current.T])
         for _ in range(steps):
             moved = current + learning_rate * gradient(space, current, weights)

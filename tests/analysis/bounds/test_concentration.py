@@ -2,22 +2,16 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from i2rl.analysis.bounds.concentration import (
-    bernstein_size,
     confidence_sequence,
     empirical_bernstein,
-    hoeffding,
-    hoeffding_error,
-    hoeffding_size,
     predictable_bernstein,
     predictable_half_width,
-    predictable_size,
 )
+from i2rl.analysis.bounds.theorems import error_for, observed_size, size_for
 
-INTERVALS = [hoeffding, empirical_bernstein, predictable_bernstein]
+INTERVALS = [empirical_bernstein, predictable_bernstein]
 
 
 def _betas(rng, mean, deviation, shape):
@@ -32,10 +26,10 @@ def test_an_interval_covers_as_often_as_it_says(interval, mean, deviation):
     assert interval(values, 0.1).covers(np.array([mean])).mean() >= 0.9
 
 
-def test_hoeffding_misses_when_values_are_dependent():
+def test_an_interval_misses_when_values_are_dependent():
     # The check above can fail: with copies of one value the interval is far too narrow.
     values = np.repeat(_betas(np.random.default_rng(2), 0.5, 0.45, (500, 1, 1)), 60, axis=1)
-    assert hoeffding(values, 0.1).covers(np.array([0.5])).mean() < 0.9
+    assert empirical_bernstein(values, 0.1).covers(np.array([0.5])).mean() < 0.9
 
 
 def test_a_confidence_sequence_covers_at_all_times_together():
@@ -47,7 +41,7 @@ def test_watching_hoeffding_at_all_times_breaks_it():
     # Why a sequence is needed: coin tosses, looked at after each one.
     values = np.random.default_rng(4).integers(0, 2, (1000, 300, 1)).astype(float)
     means = values.cumsum(axis=1) / np.arange(1, 301)[:, None]
-    half = np.array([hoeffding_error(n, 0.1) for n in range(1, 301)])[:, None]
+    half = np.array([error_for(n, 0.1, 1) for n in range(1, 301)])[:, None]
     assert (np.abs(means - 0.5) <= half).all(axis=1).mean() < 0.9
     assert confidence_sequence(values, 0.1).covers(np.array([0.5])).all(axis=1).mean() >= 0.9
 
@@ -86,28 +80,11 @@ def test_an_interval_is_the_same_for_each_quantity_and_run_alone():
         np.testing.assert_allclose(together.center[1, ..., 1:], alone.center, rtol=1e-12)
 
 
-@given(st.floats(0.01, 0.5), st.floats(0.001, 0.5))
-def test_hoeffdings_size_and_error_are_inverses(error, delta):
-    assert hoeffding_error(hoeffding_size(error, delta), delta) == pytest.approx(error)
-
-
-@given(st.floats(0.0, 0.5), st.floats(0.02, 0.3), st.floats(0.001, 0.5))
-def test_bernsteins_size_is_the_smallest_that_suffices(deviation, error, delta):
-    n = bernstein_size(deviation, error, delta)
-    log = np.log(4 / delta)
-
-    def half(n):
-        return deviation * np.sqrt(2 * log / n) + 7 * log / (3 * (n - 1))
-
-    assert half(n) <= error * (1 + 1e-12)
-    assert n == 2 or half(n - 1) > error
-
-
 @pytest.mark.parametrize(
     ("mean", "deviation", "error"), [(0.4, 0.08, 0.1), (0.03, 0.05, 0.05), (0.5, 0.3, 0.1)]
 )
 def test_the_planned_size_gives_the_planned_interval(mean, deviation, error):
-    n = predictable_size(deviation, error, 0.02)
+    n = observed_size(np.array([deviation]), error, 0.98)
     values = _betas(np.random.default_rng(8), mean, deviation, (200, n, 1))
     assert np.median(predictable_bernstein(values, 0.02).half_width) == pytest.approx(error, rel=0.1)
 
@@ -126,30 +103,30 @@ def test_the_planned_half_width_is_the_sum_over_single_values(deviation):
 
 def test_a_tiny_error_is_planned_for_at_once():
     # In the limit the interval is that of the normal approximation with the sub-Gaussian quantile.
-    assert predictable_size(0.2, 1e-8, 0.03) == pytest.approx(2 * 0.04 * np.log(2 / 0.03) / 1e-16, rel=1e-3)
+    expected = 2 * 0.04 * np.log(2 / 0.03) / 1e-16
+    assert observed_size(np.array([0.2]), 1e-8, 0.97) == pytest.approx(expected, rel=1e-3)
 
 
 def test_values_that_vary_little_need_fewer_trajectories():
-    assert predictable_size(0.08, 0.1, 0.1 / 6) < 0.5 * hoeffding_size(0.1, 0.1 / 6)
-    assert predictable_size(0.5, 0.1, 0.1 / 6) > hoeffding_size(0.1, 0.1 / 6)
+    assert observed_size(np.full(6, 0.08), 0.1, 0.9) < 0.5 * size_for(0.1, 0.1, 6)
+    assert observed_size(np.full(6, 0.5), 0.1, 0.9) > size_for(0.1, 0.1, 6)
 
 
 def test_values_outside_the_unit_interval_are_refused():
     with pytest.raises(ValueError, match=r"must lie in \[0, 1\], got 0 to 3; discounted features"):
-        hoeffding(np.array([[0.0], [3.0]]), 0.1)
+        empirical_bernstein(np.array([[0.0], [3.0]]), 0.1)
 
 
 @pytest.mark.parametrize("delta", [0.0, 1.0, -1.0, float("nan")])
 def test_a_failure_probability_outside_zero_and_one_is_refused(delta):
     with pytest.raises(ValueError, match="strictly between 0 and 1"):
-        hoeffding(np.zeros((3, 1)), delta)
+        predictable_bernstein(np.zeros((3, 1)), delta)
 
 
 def test_an_error_that_is_not_positive_is_refused():
     for size in (
-        hoeffding_size,
-        lambda e, d: bernstein_size(0.1, e, d),
-        lambda e, d: predictable_size(0.1, e, d),
+        lambda e, d: size_for(e, d, 1),
+        lambda e, d: observed_size(np.array([0.1]), e, 1 - d),
     ):
         with pytest.raises(ValueError, match="error must be positive, got 0"):
             size(0.0, 0.1)

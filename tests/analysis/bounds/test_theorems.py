@@ -16,7 +16,6 @@ from i2rl.analysis.bounds.theorems import (
     failure_probability,
     lme_constraint_bound,
     lme_i2rl_confidence,
-    maximum_entropy_confidence,
     me_i2rl_confidence,
     monotonicity,
     no_regret,
@@ -60,14 +59,10 @@ def test_size_error_and_delta_are_inverses_of_each_other(error, delta, events):
 
 @given(st.integers(1, 10_000), st.floats(0.001, 0.5), st.integers(1, 20), st.floats(0.0, 0.999))
 def test_the_theorem_by_log_likelihood_error_is_the_theorem_by_epsilon(size, epsilon, n_features, discount):
-    by_epsilon = me_i2rl_confidence(size, epsilon, n_features, discount)
-    by_error = maximum_entropy_confidence(size, by_epsilon.error, n_features, discount)
-    assert by_error.confidence == pytest.approx(by_epsilon.confidence)
+    bound = me_i2rl_confidence(size, epsilon, n_features, discount)
     # The printed delta of appendix B.
-    printed = (
-        2 * n_features * math.exp(-size * (by_epsilon.error * (1 - discount)) ** 2 / (2 * n_features**2))
-    )
-    assert by_error.confidence == pytest.approx(max(0.0, 1 - printed))
+    printed = 2 * n_features * math.exp(-size * (bound.error * (1 - discount)) ** 2 / (2 * n_features**2))
+    assert bound.confidence == pytest.approx(max(0.0, 1 - printed))
 
 
 def test_lme_spends_its_relaxation_and_its_confidence_on_both_errors():

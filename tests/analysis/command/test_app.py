@@ -307,7 +307,7 @@ def test_json_is_what_the_journal_holds(house):
     assert [r["session"] for r in learned] == [s["session"] for s in shown["sessions"]] == [1, 2, 3, 4]
     for report, session, record in zip(learned, shown["sessions"], records, strict=True):
         assert report["weights"] == session["weights"] == record.weights.tolist()
-        assert report["log_likelihood"] == session["log_likelihood"] == record.report["log_likelihood"]
+        assert report["log_likelihood"] == session["log_likelihood"] == record.info["log_likelihood"]
     assert shown["origin"]["feature_names"] == ["goes on", "is north"]
 
 

@@ -280,7 +280,7 @@ def test_the_host_is_acted_in_as_well_and_the_discriminator_sees_actions_within_
         inside = jnp.all((a >= jnp.array(BOX.low)) & (a <= jnp.array(BOX.high)), -1)
         return jnp.where(inside, discriminator.score(network, z, a, following, terminated), jnp.nan)
 
-    training = NoisyTraining(iterations=2, updates=2, replay=1, levels=(0.0, 0.3), shown="executed")
+    training = NoisyTraining(iterations=2, updates=2, replay=1, levels=(0.0, 0.3), action="executed")
     learner = noisy_airl(agent, discriminator._replace(score=guarded), training)
     rng = np.random.default_rng(0)
     demonstration = recording([rng.normal(size=(9, 2))], [rng.uniform(-1, 0.5, (9, 2))])
@@ -298,7 +298,7 @@ def test_the_host_is_acted_in_as_well_and_the_discriminator_sees_actions_within_
     ("wrong", "named"),
     [
         ({"iterations": 0}, "iterations"),
-        ({"shown": "both"}, "intended, executed"),
+        ({"action": "both"}, "intended, executed"),
         ({"levels": (0.0, 1.0)}, "noise level 1"),
         ({"levels": (0.0, 0.1, 0.2)}, "3 noise levels"),
     ],

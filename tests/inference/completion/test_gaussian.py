@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy import stats
 
 from i2rl.analysis.benchmarks.statistics.gibbs import PENDULUM, particle_smoother
 from i2rl.inference.completion.gaussian import (
@@ -224,6 +225,48 @@ def test_smoother_gibbs_and_importance_sampling_agree_on_a_pendulum():
         of_chains = total[:, i, :length]
         error = np.sqrt(of_chains.var(0, ddof=1) / 250 + spread**2 / effective)
         assert (abs(of_chains.mean(0) - reference) < 5 * error).all()
+
+
+class Coin(NamedTuple):
+    """Actions about -0.6 or 0.6 whatever the state, 64 bits."""
+
+    means: jax.Array
+
+    def moments(self, s):
+        spread = 0.04 + jnp.var(self.means)
+        return jnp.zeros((*s.shape[:-1], 1)) + self.means.mean(), jnp.full((*s.shape[:-1], 1, 1), spread)
+
+    def log_prob(self, s, a):
+        each = jax.scipy.stats.norm.logpdf(a, self.means, 0.2)
+        return jax.nn.logsumexp(each, axis=-1) - jnp.log(2.0)
+
+
+def test_gibbs_sampling_of_a_mixture_agrees_with_the_sum_over_its_components():
+    policy, sensor = Coin(jnp.array([-0.6, 0.6])), GaussianSensor(0.1, 0.3)
+    reports = np.array([0.3, 0.15, -0.2, -0.1])  # s_0, a_0, s_1, a_1
+    dynamics = jax_dynamics(lambda s, a: 0.8 * s + 0.5 * a)
+    reported = recording([reports[[0, 2], None]], [reports[[1, 3], None]])
+    gibbs = GaussianGibbs(
+        gaussian_truth(dynamics, 1, process_covariance=0.1, initial_covariance=1.0, draws=500), sweeps=1
+    )
+    chain, total = gibbs.init(reported, sensor), 0.0
+    for i in range(80):
+        chain, _ = gibbs.refresh(chain, policy, jax.random.fold_in(KEY, i), sensor)
+        if i >= 20:
+            total += np.asarray(jnp.concatenate([chain.observations, chain.actions], -1))[:, 0] / 60
+    assert 0.2 < chain.least_acceptance < 1
+
+    root = np.array([[1, 0, 0, 0], [0, 0.2, 0, 0], [0.8, 0.1, 0.1**0.5, 0], [0, 0, 0, 0.2]])
+    prior, noise = root @ root.T, np.diag([0.1, 0.3, 0.1, 0.3])
+    weights, means = [], []
+    for first in (-0.6, 0.6):
+        for second in (-0.6, 0.6):
+            mean = np.array([0, first, 0.5 * first, second])
+            weights.append(stats.multivariate_normal(mean, prior + noise).pdf(reports))
+            means.append(mean + prior @ np.linalg.solve(prior + noise, reports - mean))
+    exact = (np.array(weights) @ means / np.sum(weights)).reshape(2, 2)
+    error = total.std(0, ddof=1) / np.sqrt(500)
+    assert (abs(total.mean(0) - exact) < 5 * error).all()
 
 
 def test_smoothing_brings_a_pendulum_nearer_to_the_truth_and_knows_how_near():

@@ -54,16 +54,16 @@ def joint(chain):
     return mean.ravel(), cov.reshape(L * D, L * D)
 
 
-def closed_form(chain, readings, read):
+def closed_form(chain, observations, observed):
     """Posterior mean, covariance and log-likelihood by conditioning the joint Gaussian."""
     mean, cov = joint(chain)
-    steps = np.flatnonzero(read)
+    steps = np.flatnonzero(observed)
     H = np.zeros((len(steps), M, L, D))
     R = np.zeros((len(steps), M, len(steps), M))
     for i, t in enumerate(steps):
-        H[i, :, t], R[i, :, i] = chain.reading, chain.reading_noise[t]
+        H[i, :, t], R[i, :, i] = chain.observation, chain.observation_noise[t]
     H, R = H.reshape(-1, L * D), R.reshape(len(steps) * M, -1)
-    y = np.asarray(readings)[steps].ravel()
+    y = np.asarray(observations)[steps].ravel()
     S = H @ cov @ H.T + R
     gain = np.linalg.solve(S, H @ cov).T
     return (
@@ -73,7 +73,7 @@ def closed_form(chain, readings, read):
     )
 
 
-READ = {
+OBSERVED = {
     "all": np.ones(L, bool),
     "gaps": np.array([1, 0, 1, 0, 0, 1, 1], bool),
     "padding": np.arange(L) < 4,
@@ -81,12 +81,12 @@ READ = {
 }
 
 
-@pytest.mark.parametrize("read", READ.values(), ids=READ.keys())
+@pytest.mark.parametrize("observed", OBSERVED.values(), ids=OBSERVED.keys())
 @pytest.mark.parametrize("noise_scale", [1.0, 1e-8])
-def test_smoothing_is_the_conditional_of_the_joint_gaussian(read, noise_scale):
-    chain, readings = random_chain(3, noise_scale)
-    mean, cov, log_likelihood = closed_form(chain, readings, read)
-    smoothed = backward(forward(chain, readings, jnp.asarray(read)))
+def test_smoothing_is_the_conditional_of_the_joint_gaussian(observed, noise_scale):
+    chain, observations = random_chain(3, noise_scale)
+    mean, cov, log_likelihood = closed_form(chain, observations, observed)
+    smoothed = backward(forward(chain, observations, jnp.asarray(observed)))
     np.testing.assert_allclose(smoothed.log_likelihood, log_likelihood, atol=1e-8)
     np.testing.assert_allclose(smoothed.means, mean, atol=1e-8)
     for t in range(L):
@@ -97,19 +97,19 @@ def test_smoothing_is_the_conditional_of_the_joint_gaussian(read, noise_scale):
 
 @pytest.mark.parametrize("seed", range(3))
 def test_filtering_uses_the_past_alone(seed):
-    chain, readings = random_chain(seed)
-    filtered = forward(chain, readings, jnp.ones(L, bool))
+    chain, observations = random_chain(seed)
+    filtered = forward(chain, observations, jnp.ones(L, bool))
     for t in range(L):
-        mean, cov, _ = closed_form(chain, readings, np.arange(L) <= t)
+        mean, cov, _ = closed_form(chain, observations, np.arange(L) <= t)
         np.testing.assert_allclose(filtered.means[t], mean[t], atol=1e-8)
         np.testing.assert_allclose(filtered.covariances[t], cov[t, :, t], atol=1e-8)
 
 
 def test_draws_have_the_joint_posterior():
-    chain, readings = random_chain(5)
-    mean, cov, _ = closed_form(chain, readings, np.ones(L, bool))
+    chain, observations = random_chain(5)
+    mean, cov, _ = closed_form(chain, observations, np.ones(L, bool))
     n = 40_000
-    drawn = np.asarray(sample(jax.random.key(0), forward(chain, readings, jnp.ones(L, bool)), n))
+    drawn = np.asarray(sample(jax.random.key(0), forward(chain, observations, jnp.ones(L, bool)), n))
     cov = cov.reshape(L * D, L * D)
     spread = np.sqrt(np.diag(cov))
     assert (abs(drawn.mean(0) - mean).ravel() < 5 * spread / np.sqrt(n)).all()
@@ -118,8 +118,8 @@ def test_draws_have_the_joint_posterior():
 
 
 def test_draws_of_a_nearly_noiseless_chain_follow_its_dynamics():
-    chain, readings = random_chain(2, 1e-12)
-    drawn = np.asarray(sample(jax.random.key(1), forward(chain, readings, jnp.ones(L, bool)), 50))
+    chain, observations = random_chain(2, 1e-12)
+    drawn = np.asarray(sample(jax.random.key(1), forward(chain, observations, jnp.ones(L, bool)), 50))
     followed = np.einsum("tij,ntj->nti", chain.transition, drawn[:, :-1]) + np.asarray(chain.offset)
     assert np.isfinite(drawn).all()
     np.testing.assert_allclose(drawn[:, 1:], followed, atol=2e-5)

@@ -272,9 +272,9 @@ def test_a_learner_that_stops_and_resumes_learns_the_same_to_the_bit(learner: To
         for (state, report), record in zip(whole, journal.records(), strict=True):
             assert record.session == state.session
             assert bits(record.weights) == bits(np.asarray(state.weights))
-            assert list(record.report) == list(SessionInfo._fields)
+            assert list(record.info) == list(SessionInfo._fields)
             for name, value in report._asdict().items():
-                np.testing.assert_array_equal(record.report[name], value)
+                np.testing.assert_array_equal(record.info[name], value)
 
 
 def test_the_first_state_comes_from_the_learner(learner: Toy, tmp_path: Path) -> None:
@@ -553,7 +553,7 @@ def test_a_reader_beside_a_writer_never_meets_half_a_page(tmp_path: Path) -> Non
     for _ in range(150):
         with Journal.read(tmp_path / "j") as view:
             seen.append(view.session)
-            assert all(record.report["square"] == record.session**2 for record in view.records(last=2))
+            assert all(record.info["square"] == record.session**2 for record in view.records(last=2))
     (tmp_path / "j-enough").touch()
     _, errors = writer.communicate(timeout=60)
     assert writer.returncode == 0, errors
@@ -1023,7 +1023,7 @@ def test_a_killed_writer_loses_no_session_and_repeats_none(tmp_path: Path) -> No
                 n = journal.session
                 assert journal.position == position(n), (n, journal.position)
                 assert [record.session for record in journal.records()] == list(range(1, n + 1))
-                assert all(r.report == {"square": r.session**2} for r in journal.records())
+                assert all(r.info == {"square": r.session**2} for r in journal.records())
                 assert all((r.weights == np.arange(2.0) * r.session).all() for r in journal.records())
                 stored = journal.stored_state()
                 if n:

@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from i2rl.inference import fleet, me_i2rl, run_sessions, solve_dual
+from i2rl.inference.completion.smoothing import evidence_of
 from i2rl.inference.learners.darko import (
     darko_i2rl,
     ending_at,
@@ -23,7 +24,8 @@ from i2rl.models import (
     reward_of,
     soft_plan,
 )
-from i2rl.models.observation.demonstration import UNKNOWN
+from i2rl.models.observation.demonstration import SEEN, UNKNOWN
+from i2rl.models.observation.evidence import Sensor
 from i2rl.models.process.mdp import Labels
 from i2rl.models.process.units import with_scaled_features
 
@@ -31,6 +33,12 @@ from i2rl.models.process.units import with_scaled_features
 @jax.jit
 def plan_of(mdp, weights):
     return soft_plan(mdp, reward_of(mdp, weights))
+
+
+@jax.jit
+def margin(mdp, weights, session):
+    evidence = evidence_of(mdp, Sensor(), session)
+    return feature_margin(mdp, weights, evidence, session.kind == SEEN)
 
 
 @pytest.fixture(scope="module")
@@ -62,7 +70,7 @@ def sampled(mdp, weights, n, length, seed=0):
 def test_the_margin_is_the_gradient_of_me_i2rls_program_for_the_session_alone(world):
     weights = jnp.array([0.3, -1.0, 0.7])
     session = sampled(world, [1.0, -1.0, 0.0], 2, 4)
-    found = feature_margin(world, weights, session)
+    found = margin(world, weights, session)
 
     def dual(w):
         values = plan_of(world, jnp.asarray(w)).values
@@ -90,12 +98,12 @@ def test_one_session_learned_to_the_end_solves_me_i2rls_program(random_mdp):
     session = sampled(mdp, [-0.5, 0.4], 32, 64)
     session = session.select(np.flatnonzero(session.state[:, -1] == 5)[:16])
     assert session.n_trajectories == 16  # these have ended: nothing is left to fill in
-    target = feature_margin(mdp, jnp.zeros(2), session).statistic
+    target = margin(mdp, jnp.zeros(2), session).statistic
     solution = solve_dual(mdp, FeatureTarget(target.features, target.start))
     learner = darko_i2rl(mdp, learning_rate=0.5, decay=0.0, steps=800)
     state, info = learner.update(learner.init(jax.random.key(0)), session)
     assert np.allclose(state.weights, solution.weights, atol=1e-6)
-    assert float(jnp.linalg.norm(feature_margin(mdp, state.weights, session).margin)) < 1e-6
+    assert float(jnp.linalg.norm(margin(mdp, state.weights, session).margin)) < 1e-6
     assert info.log_likelihood == pytest.approx(-float(solution.objective))
 
 
@@ -237,7 +245,7 @@ def test_an_episodes_end_is_its_last_step(world):
     possible = ended.transition_probability(6) > 0
     s, a = np.argwhere(np.asarray(possible[:6]))[0]
     one = with_end(Demonstration.from_pairs([[s]], [[a]]), 6)
-    statistic = feature_margin(ended, jnp.ones(3), one).statistic
+    statistic = margin(ended, jnp.ones(3), one).statistic
     assert np.allclose(statistic.features, world.features[s, a])
 
 

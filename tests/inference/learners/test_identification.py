@@ -36,7 +36,7 @@ def test_from_all_starts_the_sensor_is_known_whoever_errs():
     weights = task.pair_distribution("all", 3)
     true = noisy_perception.agreement_probabilities(task.noise, task.features, weights)
     np.testing.assert_allclose(result.erratic, true, atol=0.06)
-    np.testing.assert_allclose(result.decided, true, atol=0.06)
+    np.testing.assert_allclose(result.optimal, true, atol=0.06)
 
 
 def test_from_the_natural_start_noise_may_be_the_experts_or_the_sensors():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections import namedtuple
 from dataclasses import replace
 from functools import cache
 
@@ -149,7 +150,7 @@ def test_what_is_hidden_as_well_is_summed_out():
     np.testing.assert_allclose(
         report.demonstration_log_likelihood, np.sum(law.log_prob(jnp.asarray(partly[0].codes))), rtol=1e-9
     )
-    assert float(state.reports.size) == (~hidden).sum()
+    assert float(state.observation_statistic.size) == (~hidden).sum()
 
 
 @pytest.mark.parametrize("solver", ["newton", "ipopt"])
@@ -194,6 +195,20 @@ def test_a_resumed_run_equals_an_uninterrupted_one_to_the_bit(tmp_path):
         if jnp.issubdtype(a.dtype, jax.dtypes.prng_key):
             a, b = jax.random.key_data(a), jax.random.key_data(b)
         np.testing.assert_array_equal(a, b)
+
+
+def test_a_journal_written_before_a_field_was_renamed_is_resumed(tmp_path):
+    _mdp, seen, _ = stream()
+    learner = learned_with("averaged")
+    state, info = learner.update(learner.init(KEY), seen[0])
+    names = ["reports" if name == "observation_statistic" else name for name in state._fields]
+    former = namedtuple("Former", names)(*state)
+    with Journal.open(tmp_path / "run.i2rl", learner) as journal:
+        journal.commit(former, info)
+    with Journal.open(tmp_path / "run.i2rl", learner) as journal:
+        assert type(journal.state) is type(state)
+        for name, value in state.observation_statistic._asdict().items():
+            np.testing.assert_array_equal(getattr(journal.state.observation_statistic, name), value)
 
 
 def test_padding_changes_nothing():

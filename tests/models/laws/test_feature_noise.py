@@ -7,8 +7,7 @@ import pytest
 from scipy import special, stats
 
 from i2rl.inference.programs.observation import ObservationProgram
-from i2rl.models import FeatureNoise
-from i2rl.models.laws.feature_noise import observation_feature_model, sample_observation_features
+from i2rl.models import FeatureNoise, observation_feature_model, sample_observation_features
 from i2rl.models.observation.agreement import ReportedMatches
 
 # Every combination of two predicates once: the two are independent.

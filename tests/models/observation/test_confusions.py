@@ -37,9 +37,9 @@ def test_reports_occur_as_often_as_they_should(noise: Confusions):
 
 
 def test_which_confusion_explains_a_report(noise: Confusions):
-    truth, report = jnp.array([0, 0, 2, 4]), jnp.array([0, 1, 0, 4])
+    truth, observation = jnp.array([0, 0, 2, 4]), jnp.array([0, 1, 0, 4])
     expected = [[False, False], [True, False], [False, True], [False, False]]
-    np.testing.assert_array_equal(noise.confused(truth, report), expected)
+    np.testing.assert_array_equal(noise.confused(truth, observation), expected)
 
 
 def test_composes_with_a_view(noise: Confusions):
@@ -49,7 +49,7 @@ def test_composes_with_a_view(noise: Confusions):
 
 
 @pytest.mark.parametrize(
-    ("reports", "p", "says"),
+    ("observations", "p", "says"),
     [
         (np.array([[[1, 1]], [[0, 0]]]), [0.1], "2 confusions need as many"),
         (np.array([[[1, 1]]]), [1.5], "confusion 0 is 1.5"),
@@ -58,6 +58,6 @@ def test_composes_with_a_view(noise: Confusions):
         (np.array([[0.5]]), [0.1], "whole numbers"),
     ],
 )
-def test_what_is_no_confusion_is_named(reports, p, says):
+def test_what_is_no_confusion_is_named(observations, p, says):
     with pytest.raises(ValueError, match=says):
-        Confusions(reports, np.array(p))
+        Confusions(observations, np.array(p))

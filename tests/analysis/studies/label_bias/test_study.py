@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 from i2rl.analysis.command.app import app
 from i2rl.analysis.studies.label_bias import page as label_bias_report
 from i2rl.analysis.studies.label_bias import study as label_bias
-from i2rl.analysis.studies.label_bias.study import BOLTZMANN, MAXENT, OPTIMAL, Setting
+from i2rl.analysis.studies.label_bias.study import BOLTZMANN, EXPERTS, MAXENT, OPTIMAL, Setting
 from i2rl.domains.object_world.process import random_object_world, walled_world, without_blocked_moves
 
 
@@ -29,7 +29,7 @@ _STEPS, _ETA, _DRAWS = 3, 2.0, 20_000
 def _drawn_in_the_small_world(expert, blocked):
     world = _small_world() if blocked else without_blocked_moves(_small_world())
     return label_bias.demonstrate_and_score(
-        jax.random.key(0), world.mdp, jnp.asarray(world.weights), _ETA, expert=expert, steps=_STEPS, n=_DRAWS
+        jax.random.key(0), world.mdp, jnp.asarray(world.weights), _ETA, EXPERTS.index(expert), _STEPS, _DRAWS
     )
 
 

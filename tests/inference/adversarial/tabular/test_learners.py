@@ -89,7 +89,7 @@ def watched(mdp, expert, sensor) -> tuple[Demonstration, Demonstration]:
 @pytest.fixture(scope="module")
 def learned(mdp: TabularMDP, noise: Confusions) -> Learner:
     """Learns reward, policy and sensor behind a view: every part there is."""
-    assumed = Confusions(noise.reports, np.array([0.15, 0.15]))
+    assumed = Confusions(noise.observations, np.array([0.15, 0.15]))
     visibility = Visibility(np.arange(mdp.n_states) != 1)
     return robust_airl_with_learned_sensor(
         mdp, assumed, visibility=visibility, iterations=40, learning_rate=1e-2, horizon=LENGTH
@@ -312,6 +312,6 @@ def test_what_cannot_be_combined_is_said(mdp, noise, sensor):
     with pytest.raises(ValueError, match="learned, not given"):
         robust_airl_with_learned_sensor(mdp, noise, visibility=sensor)
     with pytest.raises(ValueError, match="confusion 1 is 0"):
-        robust_airl_with_learned_sensor(mdp, Confusions(noise.reports, np.array([0.1, 0.0])))
+        robust_airl_with_learned_sensor(mdp, Confusions(noise.observations, np.array([0.1, 0.0])))
     with pytest.raises(ValueError, match="has 5 states"):
         robust_airl_tabular(mdp, Visibility(np.ones(4, bool)))
