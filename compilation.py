@@ -12,8 +12,8 @@ The environment variable ``I2RL_CACHE`` names another folder, or switches the ca
 user has set for JAX itself stands: a cache folder (``JAX_COMPILATION_CACHE_DIR`` or ``jax.config``) and the
 shortest compilation that is kept (``JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS``).
 
-:func:`compile_quickly` asks XLA for its first level of optimisation and for its older code of fused loops: this
-project's programs then compile in a third of the time and run as fast.
+:func:`compile_quickly` asks XLA for its first level of optimisation and for its older code of fused loops:
+this project's programs then compile in a third of the time and run as fast.
 """
 
 from __future__ import annotations

@@ -64,8 +64,8 @@ SMALLER = {
     "i2rl run label-bias": "--worlds 2 --trajectories 8",
     "i2rl run labyrinth": "",
     "i2rl run methods": "--sessions 8 --replications 1",
-    "i2rl run noisy-patrol": "--replications 1 --sessions 1",
-    "i2rl run noisy-sorting": "--replications 1 --sessions 1 --belts 8",
+    "i2rl run noisy-patrol": "--replications 1 --sessions 1 --draws 4",
+    "i2rl run noisy-sorting": "--replications 1 --sessions 1 --belts 8 --draws 4",
     "i2rl run patrol": "--sessions 3 --trials 4 --replications 1",
     "i2rl run robust-airl": "--sessions 1",
     "i2rl run sorting": "--trajectories 3 --replications 1 --steps 20 --belts 8",
@@ -94,7 +94,7 @@ def test_a_command_of_the_pages_runs(line, folder, monkeypatch):
     # Few methods, and a few steps of networks: the studies' own tests run the others.
     monkeypatch.setattr(noisy_study, "METHODS", (noisy_study.PLAIN, noisy_study.FAIR))
     plan = cases.PLANS["hopper"]
-    small = {"n_envs": 4, "n_steps": 16, "hidden": (8, 8)}
+    small = {"n_envs": 10, "n_steps": 32, "hidden": (8, 8)}
     monkeypatch.setitem(
         cases.PLANS,
         "hopper",

@@ -248,6 +248,9 @@ def run_robust_airl(
 
 NoisyRuns = Annotated[int, count_option("Independent repetitions.")]
 NoisySessions = Annotated[int, count_option("Sessions, of two trajectories of three pairs each.")]
+Draws = Annotated[
+    int, count_option("Draws of each of two chains of the joint posterior; none are sampled for 0.", 0)
+]
 StartsOption = Annotated[
     NoisyStarts,
     typer.Option(help="Trajectories start in all states alike, or where the task naturally does."),
@@ -260,6 +263,7 @@ def run_noisy_sorting(
     sessions: NoisySessions = 20,
     starts: StartsOption = NoisyStarts.all,
     belts: Annotated[int, count_option("Simulated belts for each method.")] = 1000,
+    draws: Draws = 100,
     seed: Seed = 0,
     folder: Annotated[Path, typer.Option(help="Folder of the page and its results.")] = Path(
         "report-noisy-sorting"
@@ -267,7 +271,7 @@ def run_noisy_sorting(
     as_json: Json = False,
 ) -> None:
     """Learn to sort onions from noisy observations, and the noise."""
-    _run_noisy("sorting", replications, sessions, starts, seed, folder, as_json, belts=belts)
+    _run_noisy("sorting", replications, sessions, starts, seed, folder, as_json, belts=belts, draws=draws)
 
 
 @commands.command("noisy-patrol")
@@ -275,6 +279,7 @@ def run_noisy_patrol(
     replications: NoisyRuns = 50,
     sessions: NoisySessions = 20,
     starts: StartsOption = NoisyStarts.all,
+    draws: Draws = 100,
     seed: Seed = 0,
     folder: Annotated[Path, typer.Option(help="Folder of the page and its results.")] = Path(
         "report-noisy-patrol"
@@ -282,7 +287,7 @@ def run_noisy_patrol(
     as_json: Json = False,
 ) -> None:
     """Learn a patroller's reward from noisy observations, also with most of the patrol out of view."""
-    _run_noisy("patrol", replications, sessions, starts, seed, folder, as_json)
+    _run_noisy("patrol", replications, sessions, starts, seed, folder, as_json, draws=draws)
 
 
 def _run_noisy(

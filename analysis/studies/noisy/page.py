@@ -242,8 +242,8 @@ def behaviour_table(study: NoisyStudy) -> Table:
     return Table(
         ("method", "replications", *headings),
         rows,
-        f"LBA after {counted(study.sessions, 'session')}: share of states in which the greedy action is one of the "
-        "expert's optimal ones; mean of replications (95 % interval). "
+        f"LBA after {counted(study.sessions, 'session')}: share of states in which the greedy action is one "
+        "of the expert's optimal ones; mean of replications (95 % interval). "
         "Choice: more than one action is available; "
         "reachable: from where the task naturally starts, by any actions.",
     )
