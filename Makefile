@@ -8,7 +8,7 @@ PEERS := .venv-peers
 BASE ?= main
 export NO_MKDOCS_2_WARNING := 1
 
-.PHONY: run test lint check docs notebooks experts bench bench-peers clean
+.PHONY: run test lint check docs pictures notebooks experts bench bench-peers clean
 
 run: $(READY)
 	$(BIN)/i2rl run patrol
@@ -36,6 +36,10 @@ docs: $(READY)
 # Execute the notebooks in place, at full size.
 notebooks: $(READY)
 	$(BIN)/python -m i2rl.analysis.notebooks.execute
+
+# Draw the pictures of the README and the documentation anew.
+pictures: $(READY)
+	$(BIN)/python tools/pictures.py
 
 # Train the experts of the continuous tasks, and record them in domains/robots/recordings.
 experts: $(READY)

@@ -232,7 +232,7 @@ def components_diagram(study: SortingStudy, theme: Theme) -> Figure:
         policy = np.asarray(greedy_policy(sorting.mdp, jnp.asarray(result.found.weights[component])))
         draw_flow(panel, theme, sorting, flow_of(sorting, policy, study.steps))
         panel.set_title(
-            f"Way {number}: {sizes[component]} of {counted(len(study.labels), 'trajectory')}\n"
+            f"Component {number}: {sizes[component]} of {counted(len(study.labels), 'trajectory')}\n"
             + _likeness(sorting, policy, behaviour_of.get(component)),
             color=theme.ink,
             fontsize=TEXT + 1,
