@@ -1,7 +1,7 @@
 """Draw the pictures of the README and of the Start page anew, into ``docs/pictures``.
 
-``make pictures`` runs the patrol study, a sorting study and the code of the Start page. Pictures of studies are
-those that their commands write.
+``make pictures`` runs the patrol study, a sorting study and the code of the Start page. Pictures of studies
+are those that their commands write.
 """
 
 import re
