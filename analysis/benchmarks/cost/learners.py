@@ -43,7 +43,7 @@ SESSIONS, STEPS = 60, 5
 Call = Callable[[jax.Array], Any]
 
 
-def learners() -> Iterator[tuple[str, str, Callable[[], tuple[Learner, Demonstration]] | Call]]:
+def cases() -> Iterator[tuple[str, str, Callable[[], tuple[Learner, Demonstration]] | Call]]:
     """Yield name, kind and either a learner with its demonstration, or a call of everything at once."""
     patrol = instance(2)
     mdp, view = patrol.mdp, patrol.visibility(patrol.observability)
@@ -129,7 +129,7 @@ def main() -> None:
     compile_quickly()
     jax.config.update("jax_enable_compilation_cache", False)
     rows: dict[str, tuple[float, float, str]] = {}
-    for name, kind, made in learners():
+    for name, kind, made in cases():
         if not options.only or name in options.only:
             rows[name] = (*measured(kind, made), kind)
             print(f"{name}: {rows[name]}", file=sys.stderr)
