@@ -12,9 +12,11 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Iterator
+from functools import partial
 from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
 from ....compilation import compile_quickly
@@ -50,7 +52,7 @@ def cases() -> Iterator[tuple[str, str, Callable[[], tuple[Learner, Demonstratio
     hidden = demonstrate(jax.random.key(0), patrol, patrol.observability, SESSIONS, STEPS)[0]
     whole = demonstrate(jax.random.key(0), patrol, 100, SESSIONS, STEPS)[0]
     predicates = np.indices((mdp.n_states, mdp.n_actions))  # the state and the action of each pair
-    noise = FeatureNoise(predicates, [0.95, 0.95])
+    noise = FeatureNoise(predicates, np.full(2, 0.95))
     exact = patrol.visibility(100)
     yield "me_i2rl", "session", lambda: (me_i2rl(mdp), whole)
     yield "lme_i2rl", "session", lambda: (lme_i2rl(mdp, view), hidden)
@@ -60,16 +62,16 @@ def cases() -> Iterator[tuple[str, str, Callable[[], tuple[Learner, Demonstratio
     yield "mme_mtirl", "session", lambda: (mme_mtirl(mdp, view, n_components=4), hidden)
     yield "airl_tabular", "session", lambda: (airl_tabular(mdp, horizon=STEPS), whole)
     yield "robust_airl_tabular", "session", lambda: (robust_airl_tabular(mdp, view, horizon=STEPS), hidden)
-    yield "fit_counts", "all", lambda key: fit_counts(mdp, visits(mdp, whole))
-    batches = {
-        "batch_lme": (batch_lme(mdp, view), hidden),
-        "robust_irl": (robust_irl(mdp, noise * view), hidden),
-        "batch_mme_mtirl": (batch_mme_mtirl(mdp, view, n_components=4), hidden),
-        "em_mlirl": (em_mlirl(mdp, n_components=2), whole),
-        "dpm_birl": (dpm_birl(mdp), whole),
-    }
-    for name, (batch, demonstration) in batches.items():
-        yield name, "all", lambda key, fit=batch.fit, given=demonstration: fit(key, given)  # type: ignore[misc]
+    yield "fit_counts", "all", lambda key: fit_counts(mdp, jnp.asarray(visits(mdp, whole)))
+    batches: tuple[tuple[str, Any, Demonstration], ...] = (
+        ("batch_lme", batch_lme(mdp, view), hidden),
+        ("robust_irl", robust_irl(mdp, noise * view), hidden),
+        ("batch_mme_mtirl", batch_mme_mtirl(mdp, view, n_components=4), hidden),
+        ("em_mlirl", em_mlirl(mdp, n_components=2), whole),
+        ("dpm_birl", dpm_birl(mdp), whole),
+    )
+    for name, batch, demonstration in batches:
+        yield name, "all", partial(lambda fit, given, key: fit(key, given), batch.fit, demonstration)
     yield "mlirl", "all", lambda key: mlirl(key, mdp, whole)
     yield "birl", "all", lambda key: birl(key, mdp, whole)
     yield "sample_posterior", "all", lambda key: sample_posterior(key, mdp, view, hidden)
