@@ -353,7 +353,7 @@ def ssrr(
         began = time.perf_counter()
         key, k_rank, k_regress = jax.random.split(state.key, 3)
         imitated: AdversarialInfo
-        imitation, imitated = first.update(state.first, recording)  # type: ignore[arg-type, assignment]
+        imitation, imitated = first.update(state.first, recording)  # type: ignore[arg-type]
         curve, ranked = rank(
             environment, imitation.generator, imitation.network, levels, how.trajectories, k_rank, how.average
         )

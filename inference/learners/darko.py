@@ -100,7 +100,7 @@ def darko_i2rl(
     decay: float = 0.5,
     radius: float = math.inf,
     steps: int = 1,
-) -> Learner:
+) -> Learner[DarkoState, SessionInfo]:
     """Build DARKO: online projected gradient descent on the feature margin, under full observability.
 
     ``theta^i = project(theta^{i-1} - lambda_i (E[phi | pi] - phi_hat^i))``, with soft value iteration for
@@ -157,7 +157,7 @@ def darko_i2rl(
     return on_scaled_features(mdp, partial(_learner, learning_rate, decay, radius, steps))
 
 
-def _learner(learning_rate: float, decay: float, radius: float, steps: int, mdp: TabularMDP) -> Learner:
+def _learner(learning_rate: float, decay: float, radius: float, steps: int, mdp: TabularMDP) -> Learner[DarkoState, SessionInfo]:
     require_discounted(mdp)
     if not 0 < learning_rate < math.inf or not radius > 0:
         raise ValueError(f"learning rate and radius must be positive, got {learning_rate} and {radius}")

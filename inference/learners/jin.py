@@ -94,7 +94,7 @@ def reward_correction(
     return Correction(now + mdp.discount * later, predicted != action)
 
 
-def jin_i2rl(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner:
+def jin_i2rl(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner[JinState, SessionInfo]:
     """Build Jin et al.'s online IRL: a reward table over states, corrected by each wrong prediction.
 
     A session of one pair is the method's own (section 3.2); a demonstration of several steps is processed
@@ -147,7 +147,7 @@ def jin_i2rl(mdp: TabularMDP, *, learning_rate: float = 1.0) -> Learner:
     return _learner("Jin et al.", with_state_features(mdp), learning_rate)
 
 
-def jin_i2rl_with_features(mdp: TabularMDP, *, learning_rate: float = 0.3) -> Learner:
+def jin_i2rl_with_features(mdp: TabularMDP, *, learning_rate: float = 0.3) -> Learner[JinState, SessionInfo]:
     """Build the same corrections on the weights of ``mdp``'s own features; see :func:`jin_i2rl`.
 
     It is a control: the method's result if it has the domain's features, as the others do. Scaled weights
@@ -157,7 +157,7 @@ def jin_i2rl_with_features(mdp: TabularMDP, *, learning_rate: float = 0.3) -> Le
     return on_scaled_features(mdp, lambda scaled: _learner("Jin et al. with features", scaled, learning_rate))
 
 
-def _learner(name: str, mdp: TabularMDP, learning_rate: float) -> Learner:
+def _learner(name: str, mdp: TabularMDP, learning_rate: float) -> Learner[JinState, SessionInfo]:
     require_discounted(mdp)
     if not 0 < learning_rate < math.inf:
         raise ValueError(f"the learning rate must be a positive number, got {learning_rate}")

@@ -108,7 +108,7 @@ def lme_i2rl(
     ridge: float = 0.0,
     name: str = "LME-I2RL",
     **alternation: Unpack[AlternationOptions],
-) -> Learner:
+) -> Learner[LMEState, SessionInfo]:
     """Build online latent maximum-entropy IRL (Algorithm 1).
 
     Parameters
@@ -170,7 +170,7 @@ def lme_i2rl(
     require_discounted(mdp)
     sensor = fitting_sensor(sensor, mdp)
 
-    def build(mdp: TabularMDP) -> Learner:
+    def build(mdp: TabularMDP) -> Learner[LMEState, SessionInfo]:
         method = checked_method(mdp, sensor, statistic, completion, slack, ridge, draws)
         configuration = {
             "statistic": statistic,
@@ -188,7 +188,7 @@ def lme_i2rl(
     return on_scaled_features(mdp, build)
 
 
-def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Learner:
+def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Learner[LMEState, SessionInfo]:
     """Build LME-I2RL without carried weights: every session starts from random ones (section 7.3).
 
     It is a control for the value of carrying the weights. Options as for :func:`lme_i2rl`.
@@ -197,7 +197,7 @@ def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: AnySensor, **options: 
     carried = lme_i2rl(mdp, sensor, name="LME-I2RL with random weights", **options)
     configuration = carried.configuration
 
-    def build(mdp: TabularMDP) -> Learner:
+    def build(mdp: TabularMDP) -> Learner[LMEState, SessionInfo]:
         method = checked_method(
             mdp,
             sensor,
@@ -219,7 +219,7 @@ def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: AnySensor, **options: 
     return on_scaled_features(mdp, build)
 
 
-def me_i2rl(mdp: TabularMDP, **options: Any) -> Learner:
+def me_i2rl(mdp: TabularMDP, **options: Any) -> Learner[LMEState, SessionInfo]:
     """Build online maximum-entropy IRL under full observability; options as for :func:`lme_i2rl`.
 
     Theorem 1 is about the program that ``statistic="features"`` solves.
@@ -447,7 +447,7 @@ def _learner(
     solver: str,
     alternation: Alternation,
     configuration: Mapping[str, Any],
-) -> Learner:
+) -> Learner[LMEState, SessionInfo]:
     mdp = method.mdp
     iterations, tolerance, _ = alternation
     if solver not in (*_IN_JAX, "ipopt", "cvxpy"):

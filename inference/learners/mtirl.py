@@ -164,7 +164,7 @@ def mme_mtirl(
     mdp: TabularMDP,
     sensor: AnySensor | None = None,
     **settings: Unpack[MixtureOptions],
-) -> Learner:
+) -> Learner[MixtureState, MixtureInfo]:
     """Build online MME-MTIRL: a session learns from its trajectories and the statistic of earlier ones (5.2).
 
     A session first explains its trajectories by the known components. If their fit is so bad that a new
@@ -228,7 +228,7 @@ def mme_mtirl(
     chosen = MixtureSettings(**settings)
     sensor = Sensor() if sensor is None else fitting_sensor(sensor, mdp)
 
-    def build(mdp: TabularMDP) -> Learner:
+    def build(mdp: TabularMDP) -> Learner[MixtureState, MixtureInfo]:
         program = _program(mdp, chosen)
         configuration = {**chosen._asdict(), "sensor": digest_of(sensor)}
         return _learner(program, sensor, chosen.n_components, chosen.restarts, configuration)
@@ -242,7 +242,7 @@ def _learner(
     n_components: int,
     restarts: int,
     configuration: Mapping[str, Any],
-) -> Learner:
+) -> Learner[MixtureState, MixtureInfo]:
     mdp = program.mdp
 
     def session(state: MixtureState, demonstration: Demonstration) -> tuple[MixtureState, MixtureInfo]:
@@ -279,8 +279,8 @@ def _learner(
         mdp,
         configuration,
         init,
-        update,  # type: ignore[arg-type]
-        session,  # type: ignore[arg-type]
+        update,
+        session,
         log_likelihood,
     )
 

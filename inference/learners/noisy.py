@@ -187,7 +187,7 @@ def rimeo(
     slack: Schedule = 0.0,
     ridge: float = DEFAULT_RIDGE,
     **settings: Unpack[RIMEOOptions],
-) -> Learner:
+) -> Learner[RIMEOState, RIMEOInfo]:
     """Build online IRL that also learns the sensor's noise (Algorithm 2).
 
     Parameters
@@ -310,7 +310,7 @@ def rimeo(
     name = "RIMEO" if completion == "posterior" else f"RIMEO ({completion})"
     first_logits = initial_logits(psi, start)
 
-    def build(mdp: TabularMDP) -> Learner:
+    def build(mdp: TabularMDP) -> Learner[RIMEOState, RIMEOInfo]:
         method = checked_method(mdp, seen, statistic, "exact", slack, ridge, 0)
         return _learner(
             name,
@@ -337,7 +337,7 @@ def rifom(
     slack: Schedule = 0.0,
     ridge: float = DEFAULT_RIDGE,
     **settings: Unpack[RIFOMOptions],
-) -> Learner:
+) -> Learner[RIMEOState, RIMEOInfo]:
     """Build RIFOM (section 7.3): RIMEO with reliabilities by counting and observations taken for the truth.
 
     ``form`` is ``"fair"`` (all steps, weighted by scores if there are any, Laplace-smoothed) or ``"coded"``
@@ -384,7 +384,7 @@ def rifom(
     }
     first_logits = initial_logits(psi, DEFAULT_START)
 
-    def build(mdp: TabularMDP) -> Learner:
+    def build(mdp: TabularMDP) -> Learner[RIMEOState, RIMEOInfo]:
         method = checked_method(mdp, seen, statistic, "exact", slack, ridge, 0)
         return _learner(
             f"RIFOM ({form})",
@@ -617,7 +617,7 @@ def _learner(
     forgetting: float,
     alternation: Alternation,
     solver: str,
-) -> Learner:
+) -> Learner[RIMEOState, RIMEOInfo]:
     perception, reporting, first_logits, scores_needed = sensing
     iterations, tolerance, _ = alternation
     if iterations < 1:
@@ -695,8 +695,8 @@ def _learner(
         mdp,
         configuration,
         init,
-        update,  # type: ignore[arg-type]
-        session if compiled else None,  # type: ignore[arg-type]
+        update,
+        session if compiled else None,
         log_likelihood,
     )
 

@@ -10,11 +10,12 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, Generic, NamedTuple
 
 import jax
 import numpy as np
 from jaxtyping import Array, Float
+from typing_extensions import TypeVar
 
 from ...models.inputs.display import brief, brief_table, joined, shown_briefly
 from ...models.observation.demonstration import Demonstration
@@ -76,8 +77,14 @@ def in_plain_numbers(info: AnyInfo, seconds: float) -> AnyInfo:
     return type(info)(**values | {"seconds": seconds})
 
 
-class Learner(NamedTuple):
+State = TypeVar("State", default=Any)
+Info = TypeVar("Info", default=Any)
+
+
+class Learner(NamedTuple, Generic[State, Info]):
     """An online learner: configuration, and two functions on an explicit state.
+
+    ``Learner[State, Info]`` names the types of its state and its info.
 
     ``session`` is the pure, compiled core of ``update`` (state and padded demonstration in, state and
     info out) that :func:`fleet` maps over many streams; None for solvers outside JAX.
@@ -86,10 +93,10 @@ class Learner(NamedTuple):
     name: str
     mdp: TabularMDP
     configuration: Mapping[str, Any]
-    init: Callable[[Array], Any]
-    update: Callable[[Any, Demonstration], tuple[Any, SessionInfo]]
-    session: Callable[[Any, Demonstration], tuple[Any, SessionInfo]] | None = None
-    log_likelihood: Callable[[Any, Float[Array, " K"]], float] | None = None
+    init: Callable[[Array], State]
+    update: Callable[[State, Demonstration], tuple[State, Info]]
+    session: Callable[[State, Demonstration], tuple[State, Info]] | None = None
+    log_likelihood: Callable[[State, Float[Array, " K"]], float] | None = None
 
     def __repr__(self) -> str:
         return joined(

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any, NamedTuple, Protocol
+from typing import Any, Generic, NamedTuple, Protocol
 
 import numpy as np
 from jaxtyping import Array, Float
@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from ...models.inputs.display import brief, brief_table, joined
 from ...models.inputs.text import counted, shortened
 from ...models.observation.demonstration import Demonstration
-from .learner import Learner, SessionInfo
+from .learner import Info, Learner, SessionInfo, State
 from .progress import progress_line
 from .serialization import demonstration_digest
 from .stopping import StoppingCriterion
@@ -45,11 +45,11 @@ class SessionStore(Protocol):
         """Return the session that learned from a demonstration; None if there is none."""
 
 
-class Run(NamedTuple):
+class Run(NamedTuple, Generic[State, Info]):
     """Final state, the sessions' infos, and a flag that a criterion stopped them."""
 
-    state: Any
-    infos: tuple[SessionInfo, ...]
+    state: State
+    infos: tuple[Info, ...]
     stopped: bool
 
     def __repr__(self) -> str:
@@ -77,17 +77,17 @@ class Run(NamedTuple):
 
 
 def run_sessions(
-    learner: Learner,
+    learner: Learner[State, Info],
     stream: Iterable[Demonstration],
     *,
     key: Array | None = None,
-    state: Any = None,
+    state: State | None = None,
     stop: StoppingCriterion | None = None,
     journal: SessionStore | None = None,
-    on_session: Callable[[Any, SessionInfo], None] | None = None,
+    on_session: Callable[[State, Info], None] | None = None,
     whole: bool | None = None,
     progress: bool = False,
-) -> Run:
+) -> Run[State, Info]:
     """Run one session per demonstration of the stream until it ends or ``stop`` returns True (Definition 7).
 
     It starts from ``state``, from the last session of ``journal``, or from ``learner.init(key)``. With a
@@ -137,35 +137,36 @@ def run_sessions(
     ([1, 2, 3, 4], True)
     """
     _require_stream(stream)
+    current: Any = state
     if journal is not None:
         if not hasattr(journal, "commit"):
             raise TypeError(f"`journal` must be Journal.open(path, learner); got {shortened(journal)}")
         if journal.origin.signature != learner.signature:
             raise ValueError(f"{journal.path} was opened for another learner than {learner.name}")
-        if state is not None and int(state.session) != journal.session:
+        if current is not None and int(current.session) != journal.session:
             raise ValueError(
-                f"the state has {int(state.session)} sessions, but {journal.path} has {journal.session}"
+                f"the state has {int(current.session)} sessions, but {journal.path} has {journal.session}"
             )
-        state = journal.state if state is None else state
-    if state is None:
+        current = journal.state if current is None else current
+    if current is None:
         if key is None:
             raise ValueError("run_sessions needs a key, a state or a journal to start from")
-        state = learner.init(key)
-    infos: list[SessionInfo] = []
+        current = learner.init(key)
+    infos: list[Any] = []
     unlearned = ((one, b"") for one in stream) if journal is None else _unlearned(stream, journal, whole)
     with progress_line(progress) as tell:
         for demonstration, digest in unlearned:
             compiling = "" if infos else ", compiling first"
-            tell(f"{learner.name}: session {int(state.session) + 1}{compiling}")
-            state, info = learner.update(state, demonstration)
+            tell(f"{learner.name}: session {int(current.session) + 1}{compiling}")
+            current, info = learner.update(current, demonstration)
             infos.append(info)
             if journal is not None:
-                journal.commit(state, info, demonstration=digest)
+                journal.commit(current, info, demonstration=digest)
             if on_session is not None:
-                on_session(state, info)
+                on_session(current, info)
             if stop is not None and stop(infos):
-                return Run(state, tuple(infos), True)
-    return Run(state, tuple(infos), False)
+                return Run(current, tuple(infos), True)
+    return Run(current, tuple(infos), False)
 
 
 def _require_stream(stream: Any) -> None:

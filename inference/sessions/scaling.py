@@ -11,7 +11,7 @@ from jaxtyping import Array, Float
 from ...models.observation.demonstration import Demonstration
 from ...models.process.mdp import TabularMDP
 from ...models.process.units import feature_scale, with_scaled_features
-from .learner import Learner
+from .learner import Info, Learner, State
 from .statistic import FeatureStatistic
 
 
@@ -46,7 +46,9 @@ def _kept(before: Any, inside: Any, new: Any, after: Any) -> Any:
     return after._replace(**changed)
 
 
-def on_scaled_features(mdp: TabularMDP, build: Callable[[TabularMDP], Learner]) -> Learner:
+def on_scaled_features(
+    mdp: TabularMDP, build: Callable[[TabularMDP], Learner[State, Info]]
+) -> Learner[State, Info]:
     """Build a learner on the process with scaled features, its states and infos in the original units.
 
     Slack, priors, initial weights, learning rates and tolerances of the learner then mean scaled weights

@@ -292,7 +292,7 @@ def _run(patrol: Patrol, learner: Learner, sessions: Demonstration, seed: int) -
         policy = greedy_policy_of(patrol.mdp, state)
         accuracy.append(float(policy_accuracy(patrol.mdp, optimal, policy).overall))
         seconds.append(report.seconds)
-    return _Run(accuracy, seconds, state, np.asarray(report.noise))  # type: ignore[attr-defined]
+    return _Run(accuracy, seconds, state, np.asarray(report.noise))
 
 
 def _at(demonstrations: Demonstration, place: Any) -> Demonstration:

@@ -63,7 +63,7 @@ def methods_table(mdp: TabularMDP, demonstration: Demonstration | None = None) -
     import pandas
 
     sensor = Sensor()
-    learners = [
+    learners: list[Learner] = [
         jin_i2rl(mdp),
         jin_i2rl_with_features(mdp),
         darko_i2rl(mdp),
