@@ -22,6 +22,7 @@ lint: $(READY)
 	$(BIN)/lint-imports
 	MYPYPATH=.editable $(BIN)/mypy --config-file pyproject.toml -p i2rl.models -p i2rl.inference -p i2rl.domains -p i2rl.analysis
 	$(BIN)/mypy --config-file pyproject.toml tools setup.py
+	MYPYPATH=.editable $(BIN)/python tools/check_pages.py
 	I2RL_DOCS_WHOLE=false $(BIN)/mkdocs build --site-dir build/lint/docs
 
 # The minute before a commit: lint, types, and the tests of what changed.

@@ -8,12 +8,13 @@ import re
 import shutil
 import tempfile
 from pathlib import Path
+from typing import Any
 
 from i2rl.compilation import compile_quickly, keep_programs
 
 FOLDER = Path(__file__).resolve().parent.parent / "docs" / "pictures"
 START = FOLDER.parent / "index.md"
-ENVIRONMENTS = {
+ENVIRONMENTS: dict[str, dict[str, Any]] = {
     "i2rl/Breach2-v0": {},
     "i2rl/SortingWithClaiming-v0": {},
     "i2rl/Labyrinth-v0": {},

@@ -29,6 +29,7 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from jaxtyping import Float, Int
+from numpy.typing import ArrayLike
 
 from ...inference.sessions.schedule import Harmonic, described
 from .assumptions import (
@@ -279,7 +280,7 @@ class Monotonicity(NamedTuple):
 
 
 def monotonicity(
-    log_likelihoods: Float[np.ndarray, " T"],
+    log_likelihoods: Float[ArrayLike, " T"],
     session_sizes: Int[np.ndarray, " T"] | Sequence[int] | None = None,
 ) -> Monotonicity:
     """Measure Lemmas 1 and 3 (Lemma 5 of appendix B, Lemma 7 of appendix E): the likelihood rises with every

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float
+from numpy.typing import ArrayLike
 
 from ...inference.completion.smoothing import evidence_of, log_likelihoods
 from ...models.inputs.text import shortened
@@ -73,7 +74,9 @@ def optimal_actions(mdp: TabularMDP, weights: Float[Array, " K"]) -> Bool[Array,
     return _optimal(mdp, _checked(mdp, weights))
 
 
-def policy_accuracy(mdp: TabularMDP, optimal: Bool[Array, "S A"], policy: Float[Array, "S A"]) -> Accuracy:
+def policy_accuracy(
+    mdp: TabularMDP, optimal: Bool[Array | np.ndarray, "S A"], policy: Float[Array | np.ndarray, "S A"]
+) -> Accuracy:
     """Compute the probability that ``policy`` takes one of the ``optimal`` actions, averaged over states.
 
     For a deterministic policy this is LBA; pass a policy here to break its ties differently. Every optimal
@@ -102,7 +105,9 @@ def policy_accuracy(mdp: TabularMDP, optimal: Bool[Array, "S A"], policy: Float[
 
 
 def learned_behavior_accuracy(
-    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
+    mdp: TabularMDP,
+    true_weights: Float[Array | np.ndarray, " K"],
+    learned_weights: Float[Array | np.ndarray, " K"],
 ) -> Accuracy:
     """Compute LBA: the share of states where the learned greedy action is one of the expert's optimal
     actions.
@@ -156,7 +161,9 @@ def behaviour_accuracies(
 
 
 def inverse_learning_error(
-    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, " K"]
+    mdp: TabularMDP,
+    true_weights: Float[Array | np.ndarray, " K"],
+    learned_weights: Float[Array | np.ndarray, " K"],
 ) -> LearningError:
     """Compute ILE of :func:`greedy_policy` of the learned weights, in units of discounted true reward.
 
@@ -182,7 +189,9 @@ def inverse_learning_error(
 
 
 def evaluate(
-    mdp: TabularMDP, true_weights: Float[Array, " K"], learned_weights: Float[Array, "*n K"]
+    mdp: TabularMDP,
+    true_weights: Float[Array | np.ndarray, " K"],
+    learned_weights: Float[Array | np.ndarray, "*n K"],
 ) -> Evaluation:
     """Compute all measures above for the cost of one of them.
 
@@ -210,7 +219,10 @@ def evaluate(
 
 
 def demonstration_log_likelihoods(
-    mdp: TabularMDP, sensor: AnySensor, weights: Float[Array, "*m K"], demonstration: Demonstration
+    mdp: TabularMDP,
+    sensor: AnySensor,
+    weights: Float[Array | np.ndarray, "*m K"],
+    demonstration: Demonstration,
 ) -> Float[Array, "*m n"]:
     """Compute the exact log-likelihood (nats) of each trajectory under the soft policy of ``weights``.
 
@@ -240,9 +252,9 @@ def demonstration_log_likelihoods(
     return each[..., : demonstration.n_trajectories]
 
 
-def _checked(mdp: TabularMDP, weights: Float[Array, "*n K"], *, many: bool = False) -> Float[Array, "*n K"]:
+def _checked(mdp: TabularMDP, given: Float[ArrayLike, "*n K"], *, many: bool = False) -> Float[Array, "*n K"]:
     require_discounted(mdp)
-    weights = jnp.asarray(weights, float)
+    weights = jnp.asarray(given, float)
     if (weights.shape[-1:] if many else weights.shape) != (mdp.n_features,):
         raise ValueError(f"weights must have shape [{mdp.n_features}], one a feature, got {weights.shape}")
     # A learner that failed must not be scored by whatever argmax makes of NaN.

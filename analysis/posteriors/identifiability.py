@@ -108,7 +108,7 @@ def identifiability_of(
     mdp: TabularMDP,
     sensor: AnySensor,
     demonstration: Demonstration,
-    weights: Float[Array, " K"] | None = None,
+    weights: Float[Array | np.ndarray, " K"] | None = None,
     *,
     scale: float = 2.5,
 ) -> Identifiability:

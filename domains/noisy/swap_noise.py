@@ -80,7 +80,9 @@ class SwapNoise(_SwapFields):
             table = table.at[jnp.arange(size), observation].add(weight)
         return ObservationModel._make((jnp.log(table).reshape(*shape, *shape),))
 
-    def confused(self, truth: Int[Array, " n"], observation: Int[Array, " n"]) -> Bool[Array, "n M"]:
+    def confused(
+        self, truth: Int[Array | np.ndarray, " n"], observation: Int[Array | np.ndarray, " n"]
+    ) -> Bool[Array, "n M"]:
         """Find the swaps that turned each truth into its observation (flat indices); none if no swaps do."""
         # The first subset that explains an observation holds no swap without effect.
         return jnp.asarray(_subsets(len(self.chances)))[

@@ -165,8 +165,8 @@ class Interaction(NamedTuple):
 def simulate_patrol(
     key: Array,
     patrol: Patrol,
-    log_policies: Float[Array, "P S A"],
-    start: Int[Array, " P"],
+    log_policies: Float[Array | np.ndarray, "P S A"],
+    start: Int[Array | np.ndarray, " P"],
     steps: int,
     interaction: Interaction = Interaction(),  # noqa: B008 (immutable)
 ) -> tuple[Int[Array, "P T"], Int[Array, "P T"]]:

@@ -172,7 +172,7 @@ class BreachOutcome(NamedTuple):
 def breach_trials(
     key: Array,
     patrol: Patrol,
-    log_policies: Float[Array, "P S A"],
+    log_policies: Float[Array | np.ndarray, "P S A"],
     *,
     watching: Watching,
     trials: int,

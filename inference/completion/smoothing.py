@@ -11,6 +11,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import lax
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
@@ -74,7 +75,7 @@ def smooth_all(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evide
 
 
 def log_likelihoods(
-    mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence
+    mdp: TabularMDP, log_policy: Float[Array | np.ndarray, "S A"], evidence: Evidence
 ) -> Float[Array, " n"]:
     """Return the exact log-likelihood of each trajectory.
 
@@ -99,7 +100,9 @@ def log_likelihoods(
     return filter_all(mdp, evidence.log_evidence + log_policy, evidence.live).log_likelihood
 
 
-def expectations(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence) -> Expectations:
+def expectations(
+    mdp: TabularMDP, log_policy: Float[Array | np.ndarray, "S A"], evidence: Evidence
+) -> Expectations:
     """Run the exact E-step (Eq. 4.1 with the sum over completions carried out).
 
     See Also
@@ -120,7 +123,7 @@ def expectations(mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evi
     >>> int(completed.size), round(float(completed.counts.sum()))  # trajectories, and their steps
     (8, 48)
     """
-    return collect(mdp, smooth_all(mdp, log_policy, evidence), evidence.live)
+    return collect(mdp, smooth_all(mdp, jnp.asarray(log_policy), evidence), evidence.live)
 
 
 def collect(mdp: TabularMDP, posterior: Smoothed, live: Bool[Array, "n L"]) -> Expectations:
@@ -141,7 +144,7 @@ def collect(mdp: TabularMDP, posterior: Smoothed, live: Bool[Array, "n L"]) -> E
 
 
 def sample_completions(
-    key: Array, mdp: TabularMDP, log_policy: Float[Array, "S A"], evidence: Evidence, draws: int
+    key: Array, mdp: TabularMDP, log_policy: Float[Array | np.ndarray, "S A"], evidence: Evidence, draws: int
 ) -> tuple[Int[Array, "draws n L"], Int[Array, "draws n L"]]:
     """Draw independent joint completions (states, actions) by backward sampling; -1 on padding.
 

@@ -157,7 +157,9 @@ def darko_i2rl(
     return on_scaled_features(mdp, partial(_learner, learning_rate, decay, radius, steps))
 
 
-def _learner(learning_rate: float, decay: float, radius: float, steps: int, mdp: TabularMDP) -> Learner[DarkoState, SessionInfo]:
+def _learner(
+    learning_rate: float, decay: float, radius: float, steps: int, mdp: TabularMDP
+) -> Learner[DarkoState, SessionInfo]:
     require_discounted(mdp)
     if not 0 < learning_rate < math.inf or not radius > 0:
         raise ValueError(f"learning rate and radius must be positive, got {learning_rate} and {radius}")

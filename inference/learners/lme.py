@@ -188,7 +188,9 @@ def lme_i2rl(
     return on_scaled_features(mdp, build)
 
 
-def lme_i2rl_with_random_weights(mdp: TabularMDP, sensor: AnySensor, **options: Any) -> Learner[LMEState, SessionInfo]:
+def lme_i2rl_with_random_weights(
+    mdp: TabularMDP, sensor: AnySensor, **options: Any
+) -> Learner[LMEState, SessionInfo]:
     """Build LME-I2RL without carried weights: every session starts from random ones (section 7.3).
 
     It is a control for the value of carrying the weights. Options as for :func:`lme_i2rl`.

@@ -174,7 +174,7 @@ def solve_scaled_dual(
 
 def fit_counts(
     mdp: TabularMDP,
-    counts: Float[Array, "S A"],
+    counts: Float[Array | np.ndarray, "S A"],
     slack: ArrayLike = 0.0,
     ridge: ArrayLike = 0.0,
     start: WarmStart | None = None,
@@ -219,7 +219,10 @@ def fit_counts(
     require_discounted(mdp)
     scale = feature_scale(mdp)
     return _unscaled(
-        fit_scaled_counts(with_scaled_features(mdp), counts, slack, ridge, _scaled(start, scale)), scale
+        fit_scaled_counts(
+            with_scaled_features(mdp), jnp.asarray(counts), slack, ridge, _scaled(start, scale)
+        ),
+        scale,
     )
 
 

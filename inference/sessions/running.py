@@ -12,7 +12,7 @@ from jaxtyping import Array, Float
 from ...models.inputs.display import brief, brief_table, joined
 from ...models.inputs.text import counted, shortened
 from ...models.observation.demonstration import Demonstration
-from .learner import Info, Learner, SessionInfo, State
+from .learner import Info, Learner, State
 from .progress import progress_line
 from .serialization import demonstration_digest
 from .stopping import StoppingCriterion

@@ -201,8 +201,8 @@ class MixtureLaw(dist.Distribution):
     def __init__(
         self,
         mdp: TabularMDP,
-        proportions: Float[Array, "... T"],
-        weights: Float[Array, "T K"],
+        proportions: Float[Array | np.ndarray, "... T"],
+        weights: Float[Array | np.ndarray, "T K"],
         sensor: AnySensor,
         length: int,
         *,
@@ -214,9 +214,9 @@ class MixtureLaw(dist.Distribution):
                 f"a mixture has a proportion for each row of weights, got shapes {proportions.shape} "
                 f"and {weights.shape}"
             )
-        self.mdp, self.proportions, self.weights = mdp, proportions, weights
+        self.mdp, self.proportions, self.weights = mdp, jnp.asarray(proportions), jnp.asarray(weights)
         self.sensor, self.length = sensor, length
-        self.log_policies = soft_policies(mdp, weights)
+        self.log_policies = soft_policies(mdp, self.weights)
         super().__init__(proportions.shape[:-1], (length, 3), validate_args=validate_args)
 
     @property
@@ -239,7 +239,7 @@ class MixtureLaw(dist.Distribution):
         return codes.reshape((*shape, self.length, 3))
 
     @validate_sample
-    def log_prob(self, value: Int[Array, "... L 3"]) -> Float[Array, "..."]:
+    def log_prob(self, value: Int[Array | np.ndarray, "... L 3"]) -> Float[Array, "..."]:
         """Return the exact log-probability of observations; components and hidden steps summed out."""
         value = checked_codes(self.mdp, value)
         if value.shape[-2:] != (self.length, 3):
@@ -274,10 +274,10 @@ def concentration_prior(
 def mixture_model(
     mdp: TabularMDP,
     sensor: AnySensor,
-    codes: Int[Array, "n L 3"] | Perceived | None = None,
+    codes: Int[Array | np.ndarray, "n L 3"] | Perceived | None = None,
     *,
     components: int = COMPONENTS,
-    concentration: float | Float[Array, ""] | dist.Distribution = 1.0,
+    concentration: float | Float[Array | np.ndarray, ""] | dist.Distribution = 1.0,
     prior: dist.Distribution | None = None,
     n_trajectories: int | None = None,
     length: int | None = None,

@@ -12,6 +12,7 @@ from typing import NamedTuple, TypedDict, Unpack
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Bool, Int
@@ -71,14 +72,14 @@ class NoisyPriorOptions(TypedDict, total=False):
 
 def noisy_behaviour_model(
     mdp: TabularMDP,
-    predicates: Bool[Array, "J S A"] | Int[Array, "J S A"],
-    codes: Int[Array, "n L 3"] | None = None,
+    predicates: Bool[Array | np.ndarray, "J S A"] | Int[Array | np.ndarray, "J S A"],
+    codes: Int[Array | np.ndarray, "n L 3"] | None = None,
     *,
     visibility: AnySensor | None = None,
-    reportable: Bool[Array, "S A"] | None = None,
+    reportable: Bool[Array | np.ndarray, "S A"] | None = None,
     n_trajectories: int | None = None,
     length: int | None = None,
-    repeats: Int[Array, " n"] | None = None,
+    repeats: Int[Array | np.ndarray, " n"] | None = None,
     **priors: Unpack[NoisyPriorOptions],
 ) -> Int[Array, "n L 3"]:
     r"""Define the NumPyro model of demonstrations under :class:`FeatureNoise` of unknown reliabilities.

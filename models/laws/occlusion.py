@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import Any
 
 import jax.numpy as jnp
+import numpy as np
 import numpyro
 import numpyro.distributions as dist
 from jaxtyping import Array, Bool, Float, Int
@@ -123,12 +124,12 @@ def scaled_prior(mdp: TabularMDP, prior: dist.Distribution | None = None) -> Sca
 def occlusion_model(
     mdp: TabularMDP,
     sensor: AnySensor,
-    codes: Int[Array, "n L 3"] | None = None,
+    codes: Int[Array | np.ndarray, "n L 3"] | None = None,
     *,
     n_trajectories: int | None = None,
     length: int | None = None,
     prior: dist.Distribution | None = None,
-    repeats: Int[Array, " n"] | None = None,
+    repeats: Int[Array | np.ndarray, " n"] | None = None,
 ) -> Int[Array, "n L 3"]:
     r"""Define the NumPyro model of demonstrations seen through ``sensor``.
 

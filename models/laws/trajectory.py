@@ -110,7 +110,7 @@ class TrajectoryLaw(dist.Distribution):
         return codes.reshape((*sample_shape, self.length, 3))
 
     @validate_sample
-    def log_prob(self, value: Int[Array, "... L 3"]) -> Float[Array, "..."]:
+    def log_prob(self, value: Int[Array | np.ndarray, "... L 3"]) -> Float[Array, "..."]:
         """Return the exact log-probability of observations, hidden steps summed out."""
 
         def evidence(code: Int[Array, " 3"]) -> Float[Array, "S A"]:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from ..inputs.arguments import concrete, is_traced, rebuilt_unchecked
 from ..inputs.display import shown_briefly
@@ -41,7 +42,7 @@ class Confusions(_ConfusionFields):
 
     __slots__ = ()
 
-    def __new__(cls, observations: np.ndarray | Array, chances: np.ndarray | Array) -> Confusions:
+    def __new__(cls, observations: ArrayLike, chances: ArrayLike) -> Confusions:
         """Check and convert; see the class."""
         flat = jnp.asarray(observations if is_traced(observations) else _checked(np.asarray(observations)))
         p = concrete("chances", chances)
@@ -87,7 +88,9 @@ class Confusions(_ConfusionFields):
         table = table.at[g, self.observations.reshape(-1, size)].add(chance)
         return ObservationModel._make((jnp.log(table).reshape(*shape, *shape),))
 
-    def confused(self, truth: Int[Array, " n"], observation: Int[Array, " n"]) -> Bool[Array, "n M"]:
+    def confused(
+        self, truth: Int[Array | np.ndarray, " n"], observation: Int[Array | np.ndarray, " n"]
+    ) -> Bool[Array, "n M"]:
         """Mark the confusion that turned each hidden pair into its observation (flat indices), if any did."""
         flat = self.observations.reshape(len(self.chances), -1)[:, truth]
         return ((flat == observation) & (flat != truth)).T

@@ -20,6 +20,7 @@ from typing import IO, Any, NamedTuple, NoReturn
 import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 
 from ..inputs.display import brief_repr, brief_table, fields_of, joined, readable, shown_briefly, step_range
 from ..inputs.text import JSONError, JSONSyntaxError, counted, listed, parsed_json, shortened
@@ -146,7 +147,7 @@ class Demonstration:
         )
 
     @staticmethod
-    def from_pairs(states: Int[np.ndarray, "n L"], actions: Int[np.ndarray, "n L"]) -> Demonstration:
+    def from_pairs(states: Int[ArrayLike, "n L"], actions: Int[ArrayLike, "n L"]) -> Demonstration:
         """Build fully observed trajectories of one length from whole numbers ``[n, L]`` or ``[L]``.
 
         Floats must be whole. Use :meth:`from_arrays` if steps are hidden or trajectories differ in length.
@@ -157,13 +158,13 @@ class Demonstration:
 
     @staticmethod
     def from_arrays(
-        states: Int[np.ndarray, "n L"],
-        actions: Int[np.ndarray, "n L"],
+        states: Int[ArrayLike, "n L"],
+        actions: Int[ArrayLike, "n L"],
         *,
-        seen: Bool[np.ndarray, "n L"] | None = None,
-        lost: Bool[np.ndarray, "n L"] | None = None,
-        lengths: Int[np.ndarray, " n"] | None = None,
-        scores: Float[np.ndarray, "n L"] | None = None,
+        seen: Bool[ArrayLike, "n L"] | None = None,
+        lost: Bool[ArrayLike, "n L"] | None = None,
+        lengths: Int[ArrayLike, " n"] | None = None,
+        scores: Float[ArrayLike, "n L"] | None = None,
         missing: float | None = None,
     ) -> Demonstration:
         """Build trajectories from arrays in which steps may be hidden.

@@ -223,7 +223,10 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
         return self
 
     def log_likelihood(
-        self, state: Int[Array, ""], action: Int[Array, ""], score: Float[Array, ""]
+        self,
+        state: Int[Array | np.ndarray, ""],
+        action: Int[Array | np.ndarray, ""],
+        score: Float[Array | np.ndarray, ""],
     ) -> Float[Array, "S A"]:
         """Return ``log O(o | s, a)`` of one observation for each truth; a hidden coordinate is summed out."""
         del score  # fixed noise takes no account of confidence
@@ -235,7 +238,7 @@ class ObservationModel(_Composable, _ObservationFields):  # type: ignore[misc]
         return jnp.where(action == UNKNOWN, summed, by_state[:, :, jnp.maximum(action, 0)])
 
     def report(
-        self, key: Array, state: Int[Array, ""], action: Int[Array, ""]
+        self, key: Array, state: Int[Array | np.ndarray, ""], action: Int[Array | np.ndarray, ""]
     ) -> tuple[Int[Array, ""], Int[Array, ""]]:
         """Draw the observation of a pair."""
         flat = jax.random.categorical(key, self.log_probabilities[state, action].reshape(-1))
@@ -300,9 +303,9 @@ class FeatureNoise(_Composable, _NoiseFields):  # type: ignore[misc]
 
     def __new__(
         cls,
-        predicates: np.ndarray | Array,
-        reliabilities: np.ndarray | Array,
-        reportable: np.ndarray | Array | None = None,
+        predicates: ArrayLike,
+        reliabilities: ArrayLike,
+        reportable: ArrayLike | None = None,
     ) -> FeatureNoise:
         """Check and convert; see the class."""
         psi = jnp.asarray(predicates if is_traced(predicates) else checked_predicates(predicates))
@@ -571,7 +574,10 @@ def log_evidence(sensor: AnySensor, mdp: TabularMDP, demonstration: Demonstratio
 
 
 def observe(
-    key: Array, sensor: AnySensor, states: Int[Array, " L"], actions: Int[Array, " L"]
+    key: Array,
+    sensor: AnySensor,
+    states: Int[Array | np.ndarray, " L"],
+    actions: Int[Array | np.ndarray, " L"],
 ) -> Int[Array, "L 3"]:
     """Pass a true trajectory through a sensor; return codes (kind, state, action) of the observations.
 
@@ -606,7 +612,7 @@ def observe(
         return jnp.where(seen, values, jnp.array([HIDDEN, UNKNOWN, UNKNOWN])).astype(jnp.int32)
 
     keys = jax.random.split(as_key(key), states.shape[0])
-    return jax.vmap(one)(keys, states, actions)
+    return jax.vmap(one)(keys, jnp.asarray(states), jnp.asarray(actions))
 
 
 _evidence = jax.jit(step_log_evidence, static_argnums=(1, 2))

@@ -331,13 +331,13 @@ class TabularMDP:
         digest.update(repr((self.labels.states, self.labels.actions, self.labels.features)).encode())
         return digest.hexdigest()
 
-    def with_initial(self, initial: Float[Array, " S"]) -> TabularMDP:
+    def with_initial(self, initial: Float[Array | np.ndarray, " S"]) -> TabularMDP:
         """Replace the initial distribution (unchecked, so that it works under a trace)."""
-        return replace(self, initial=initial)
+        return replace(self, initial=jnp.asarray(initial))
 
-    def with_probabilities(self, probabilities: Float[Array, "S A B"]) -> TabularMDP:
+    def with_probabilities(self, probabilities: Float[Array | np.ndarray, "S A B"]) -> TabularMDP:
         """Replace the probabilities of the same successors (unchecked, so that it works under a trace)."""
-        return replace(self, probabilities=probabilities)
+        return replace(self, probabilities=jnp.asarray(probabilities))
 
     def without_inflow(self) -> TabularMDP:
         """Drop the inflow table, whose width differs between processes of one size."""
@@ -352,22 +352,22 @@ class TabularMDP:
             return None
         return jnp.where(self.inflow_slots < 0, 0.0, self.probabilities.reshape(-1)[self.inflow_slots])
 
-    def expect_next(self, values: Float[Array, " S"]) -> Float[Array, "S A"]:
+    def expect_next(self, values: Float[Array | np.ndarray, " S"]) -> Float[Array, "S A"]:
         """Return the expected value after each pair, ``sum_s' P(s' | s, a) v(s')``."""
         return jnp.einsum("sab,sab->sa", self.probabilities, values[self.successors])
 
-    def push_forward(self, pairs: Float[Array, "S A"]) -> Float[Array, " S"]:
+    def push_forward(self, pairs: Float[Array | np.ndarray, "S A"]) -> Float[Array, " S"]:
         """Return mass on the next state from mass on pairs, ``sum_{s, a} x(s, a) P(s' | s, a)``."""
         if self.inflow_pairs is not None:
             return jnp.einsum("sm,sm->s", self.inflow_probabilities, pairs.reshape(-1)[self.inflow_pairs])
         flow = pairs[..., None] * self.probabilities
         return jax.ops.segment_sum(flow.reshape(-1), self.successors.reshape(-1), self.n_states)
 
-    def transition_probability(self, state: Int[Array, ""]) -> Float[Array, "S A"]:
+    def transition_probability(self, state: Int[Array | np.ndarray, ""]) -> Float[Array, "S A"]:
         """Return the probability of reaching ``state`` from each pair, ``P(state | s, a)``."""
         return jnp.sum(jnp.where(self.successors == state, self.probabilities, 0.0), axis=-1)
 
-    def state_transitions(self, policy: Float[Array, "S A"]) -> Float[Array, "S S"]:
+    def state_transitions(self, policy: Float[Array | np.ndarray, "S A"]) -> Float[Array, "S S"]:
         """Return the Markov chain of a policy as a dense matrix ``[S, S]`` (small state spaces only)."""
         flow = policy[..., None] * self.probabilities
         rows = jnp.broadcast_to(jnp.arange(self.n_states)[:, None, None], self.successors.shape)

@@ -83,7 +83,7 @@ class HardPlan(NamedTuple):
     optimal: Bool[Array, "S A"]
 
 
-def reward_of(mdp: TabularMDP, weights: Float[Array, " K"]) -> Float[Array, "S A"]:
+def reward_of(mdp: TabularMDP, weights: Float[Array | np.ndarray, " K"]) -> Float[Array, "S A"]:
     """Return the reward ``theta . phi(s, a)`` of every pair. Raises ``ValueError`` for a weight of NaN.
 
     See Also
@@ -137,7 +137,9 @@ def _require_numbers(mdp: TabularMDP, what: str, table: Any) -> None:
 
 
 def soft_plan(
-    mdp: TabularMDP, reward: Float[Array, "S A"], start: Float[Array, " S"] | None = None
+    mdp: TabularMDP,
+    reward: Float[Array | np.ndarray, "S A"],
+    start: Float[Array | np.ndarray, " S"] | None = None,
 ) -> SoftPlan:
     """Solve the soft Bellman equations over an infinite discounted horizon.
 
@@ -201,7 +203,7 @@ def _soft_values_jvp(primals: tuple, tangents: tuple) -> tuple:
     return values, solve_values(mdp, policy, residual)
 
 
-def hard_plan(mdp: TabularMDP, reward: Float[Array, "S A"], tolerance: float = 1e-9) -> HardPlan:
+def hard_plan(mdp: TabularMDP, reward: Float[Array | np.ndarray, "S A"], tolerance: float = 1e-9) -> HardPlan:
     """Solve the Bellman optimality equations; actions within ``tolerance`` of the best count as optimal.
 
     ``tolerance`` is relative to the spread of the values. Policy iteration, with direct solves up to
@@ -251,7 +253,7 @@ def greedy_actions(q: Float[Array, "S A"], tolerance: float | Array = 1e-9) -> B
     return q >= best - tolerance * (1 + jnp.max(finite) - jnp.min(finite))
 
 
-def deterministic_policy(optimal: Bool[Array, "S A"]) -> Float[Array, "S A"]:
+def deterministic_policy(optimal: Bool[Array | np.ndarray, "S A"]) -> Float[Array, "S A"]:
     """Return the policy of the first optimal action of each state; NaN if a state has none.
 
     See Also
@@ -470,7 +472,7 @@ def _by_column(function: Callable[[Float[Array, " S"]], Float[Array, " S"]], x: 
 
 
 def policy_values(
-    mdp: TabularMDP, policy: Float[Array, "S A"], reward: Float[Array, "S A"]
+    mdp: TabularMDP, policy: Float[Array | np.ndarray, "S A"], reward: Float[Array | np.ndarray, "S A"]
 ) -> Float[Array, " S"]:
     """Return the exact discounted values ``V^pi(s)`` of a policy under a reward.
 
@@ -515,7 +517,9 @@ def _features_to_go(mdp: TabularMDP, policy: Float[Array, "S A"]) -> Float[Array
 
 
 def occupancy(
-    mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
+    mdp: TabularMDP,
+    policy: Float[Array | np.ndarray, "S A"],
+    initial: Float[Array | np.ndarray, " S"] | None = None,
 ) -> Float[Array, "S A"]:
     """Return the occupancy ``x(s, a) = sum_t gamma^t P(s_t = s, a_t = a)``, of sum ``1 / (1 - gamma)``.
 
@@ -550,7 +554,9 @@ def _occupancy(
 
 
 def feature_expectations(
-    mdp: TabularMDP, policy: Float[Array, "S A"], initial: Float[Array, " S"] | None = None
+    mdp: TabularMDP,
+    policy: Float[Array | np.ndarray, "S A"],
+    initial: Float[Array | np.ndarray, " S"] | None = None,
 ) -> Float[Array, " K"]:
     """Return the expected discounted features ``E_X[phi_k]`` of a policy.
 
@@ -613,7 +619,7 @@ class FinitePlan(NamedTuple):
     log_policy: Float[Array, "T S A"]
 
 
-def finite_soft_plan(mdp: TabularMDP, reward: Float[Array, "S A"], horizon: int) -> FinitePlan:
+def finite_soft_plan(mdp: TabularMDP, reward: Float[Array | np.ndarray, "S A"], horizon: int) -> FinitePlan:
     """Plan softly over ``horizon`` steps in one backward pass; any discount in (0, 1].
 
     See Also
@@ -703,9 +709,9 @@ def reachable_states(mdp: TabularMDP, initial: np.ndarray | None = None) -> np.n
 def simulate(
     key: Array,
     mdp: TabularMDP,
-    log_policy: Float[Array, "S A"],
+    log_policy: Float[Array | np.ndarray, "S A"],
     length: int,
-    first: Int[Array, ""] | None = None,
+    first: Int[Array | np.ndarray, ""] | None = None,
 ) -> tuple[Int[Array, " T"], Int[Array, " T"]]:
     """Draw one trajectory of ``length`` pairs (states, actions) under a policy, from ``first`` or ``p0``.
 
