@@ -38,14 +38,14 @@ def draw_studies(folder: Path) -> None:
 
 
 def draw_start() -> None:
-    """Run the code of the Start page up to its picture, and draw that in both themes."""
+    """Run the code of the Start page up to its picture, which is drawn in both themes instead."""
     from i2rl.analysis import completed_path
     from i2rl.analysis.drawing.style import save_themes
 
     blocks = re.findall(r"```python\n(.*?)```", START.read_text(), re.DOTALL)
     made: dict[str, object] = {}
     for code in blocks[: 1 + next(i for i, code in enumerate(blocks) if "completed_path" in code)]:
-        exec(compile(code, str(START), "exec"), made)
+        exec(compile(code.partition("picture = ")[0], str(START), "exec"), made)
     mdp, posterior, layout, states = (made[name] for name in ("mdp", "posterior", "layout", "states"))
     save_themes(
         lambda theme: completed_path(mdp, posterior, [6], layout, path=states[6], theme=theme),  # type: ignore
