@@ -52,6 +52,7 @@ bench: $(READY)
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.accuracy
 	$(BIN)/python -m i2rl.analysis.benchmarks.cost.planning
 	$(BIN)/python -m i2rl.analysis.benchmarks.cost.posterior
+	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.kept_likelihood
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.calibration
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.components
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.mixture

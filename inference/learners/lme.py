@@ -52,9 +52,12 @@ from .alternation import (
     random_weights,
     relative_change,
 )
+from .likelihood import ITERATIONS, likelihood_learner
 
 # Nats per trajectory and unit of scaled weight. A smaller slack admits nearly deterministic experts.
 DEFAULT_SLACK = 0.002
+# Nats in all, of scaled weights; nearer zero the kept likelihood can run away to a plateau.
+DEFAULT_KEPT_RIDGE = 0.02
 
 
 @shown_briefly
@@ -104,8 +107,8 @@ def lme_i2rl(
     statistic: str = "seen",
     completion: str = "exact",
     solver: str = "newton",
-    slack: Schedule = DEFAULT_SLACK,
-    ridge: float = 0.0,
+    slack: Schedule | None = None,
+    ridge: float | None = None,
     name: str = "LME-I2RL",
     **alternation: Unpack[AlternationOptions],
 ) -> Learner[LMEState, SessionInfo]:
@@ -117,8 +120,10 @@ def lme_i2rl(
         The expert's process without its reward; discount below 1.
     sensor : Sensor
         Visibility and noise of the learner's perception.
-    statistic : {"seen", "counts", "features"}
-        Summary of a session; see :mod:`i2rl.inference.sessions.statistic`.
+    statistic : {"seen", "counts", "features", "likelihood"}
+        Summary of a session; see :mod:`i2rl.inference.sessions.statistic`. ``"likelihood"`` keeps the
+        likelihood itself (:mod:`i2rl.inference.sessions.kept_likelihood`), which stays near batch learning
+        where steps are read in part or wrongly; it has no slack, and takes Newton steps.
     completion : {"exact", "blocked", "gibbs"}
         The E-step: exact, or estimated from ``draws`` (957 by default).
     solver : {"newton", "ipopt", "cvxpy", "exponentiated gradient"}
@@ -130,13 +135,15 @@ def lme_i2rl(
         scaled weights, rewards in nats that each feature adds at most (:mod:`~i2rl.models.process.units`)
         (``slack / (1 - gamma)`` with the ``features`` statistic, as in Theorem 1). A function is a schedule,
         as in Optax: JAX traces it from the session's number, counted from 1;
-        :class:`~i2rl.inference.sessions.schedule.Harmonic` is that of the no-regret theorem (Eq. 4.3).
+        :class:`~i2rl.inference.sessions.schedule.Harmonic` is that of the no-regret theorem (Eq. 4.3). 0.002
+        by default; none with the ``likelihood`` statistic.
     ridge : float
         Precision of a Gaussian prior on the scaled weights (nats in all, not per trajectory); for the newton
-        and ipopt solvers.
+        and ipopt solvers. None by default; 0.02 with the ``likelihood`` statistic.
     iterations, tolerance : int, float
         A session ends after this number of E- and M-steps (10 by default), or when no scaled weight moves by
-        more than ``tolerance`` (1e-3 by default) relative to the largest.
+        more than ``tolerance`` (1e-3 by default) relative to the largest. With the ``likelihood`` statistic:
+        Newton steps (3 by default), and the absolute length of the last (1e-6 by default).
 
     Returns
     -------
@@ -166,9 +173,12 @@ def lme_i2rl(
     >>> learner.name, info.session, bool(state.weights[0] > 0)  # the end is worth something
     ('LME-I2RL', 1, True)
     """
-    iterations, tolerance, draws = steps = Alternation(**alternation)
     require_discounted(mdp)
     sensor = fitting_sensor(sensor, mdp)
+    if statistic == "likelihood":
+        return _with_kept_likelihood(mdp, sensor, completion, solver, slack, ridge, name, alternation)
+    iterations, tolerance, draws = steps = Alternation(**alternation)
+    slack, ridge = DEFAULT_SLACK if slack is None else slack, 0.0 if ridge is None else ridge
 
     def build(mdp: TabularMDP) -> Learner[LMEState, SessionInfo]:
         method = checked_method(mdp, sensor, statistic, completion, slack, ridge, draws)
@@ -184,6 +194,44 @@ def lme_i2rl(
             "sensor": digest_of(sensor),
         }
         return _learner(name, method, _carried_on, solver, steps, configuration)
+
+    return on_scaled_features(mdp, build)
+
+
+def _with_kept_likelihood(
+    mdp: TabularMDP,
+    sensor: AnySensor,
+    completion: str,
+    solver: str,
+    slack: Schedule | None,
+    ridge: float | None,
+    name: str,
+    alternation: AlternationOptions,
+) -> Learner[LMEState, SessionInfo]:
+    if completion != "exact" or solver != "newton":
+        raise ValueError(
+            "the likelihood statistic completes exactly and takes Newton steps, "
+            f"got completion={completion!r} and solver={solver!r}"
+        )
+    if slack is not None and (callable(slack) or slack != 0):
+        raise ValueError("the likelihood statistic has no slack: give a ridge instead")
+    iterations = alternation.get("iterations", ITERATIONS)
+    tolerance = alternation.get("tolerance", 1e-6)
+    if iterations < 1:
+        raise ValueError(f"a session needs at least one iteration, got {iterations}")
+
+    def build(mdp: TabularMDP) -> Learner:
+        method = checked_method(
+            mdp, sensor, "counts", "exact", 0.0, DEFAULT_KEPT_RIDGE if ridge is None else ridge, 0
+        )
+        configuration = {
+            "statistic": "likelihood",
+            "ridge": method.ridge,
+            "iterations": iterations,
+            "tolerance": tolerance,
+            "sensor": digest_of(sensor),
+        }
+        return likelihood_learner(name, method, LMEState, configuration, iterations, tolerance)
 
     return on_scaled_features(mdp, build)
 

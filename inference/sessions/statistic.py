@@ -14,6 +14,9 @@ steps, and therefore in the later weight of early, poor completions:
     current session count in full through its exact likelihood, and are then dropped. With full visibility it
     equals ``counts``. A noisy or partial observation enters by its posterior under the weights of its
     session.
+
+Where steps are read in part or wrongly, all three keep what early weights made of them.
+:mod:`~i2rl.inference.sessions.kept_likelihood` keeps the likelihood instead.
 """
 
 from __future__ import annotations
