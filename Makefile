@@ -49,16 +49,16 @@ experts: $(READY)
 bench: $(READY)
 	$(BIN)/python -m i2rl.analysis.benchmarks.cost.sessions
 	$(BIN)/python -m i2rl.analysis.benchmarks.cost.learners
-	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.accuracy
+	$(BIN)/python -m i2rl.analysis.benchmarks.online.accuracy
 	$(BIN)/python -m i2rl.analysis.benchmarks.cost.planning
 	$(BIN)/python -m i2rl.analysis.benchmarks.cost.posterior
-	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.kept_likelihood
+	$(BIN)/python -m i2rl.analysis.benchmarks.online.kept_likelihood
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.calibration
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.components
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.mixture
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.coverage
-	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.regret
-	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.stopping
+	$(BIN)/python -m i2rl.analysis.benchmarks.online.regret
+	$(BIN)/python -m i2rl.analysis.benchmarks.online.stopping
 	$(BIN)/python -m i2rl.analysis.benchmarks.statistics.selection
 	$(BIN)/python -m i2rl.analysis.benchmarks.faults.kills
 	$(BIN)/python -m i2rl.analysis.benchmarks.faults.journals

@@ -1,4 +1,4 @@
-"""Benchmarks of statistical behaviour: calibration, coverage, accuracy.
+"""Benchmarks of statistical behaviour: calibration, coverage, components found.
 
 Imports every room but the command line's.
 """

@@ -1,6 +1,6 @@
 """Accuracy of online learning under occlusion, on the three patrols.
 
-``python -m i2rl.analysis.benchmarks.statistics.accuracy`` prints learned behaviour accuracy of LME-I2RL after
+``python -m i2rl.analysis.benchmarks.online.accuracy`` prints learned behaviour accuracy of LME-I2RL after
 some sessions of five steps, for every sufficient statistic, beside batch LME on the same data and the same
 accuracy of random rewards: medians over replications and patrollers, and the share of replications within
 0.01 of batch.

@@ -13,7 +13,7 @@ The width of a window determines the result. For up to 10 sessions in a row no s
 56 steps), the learner's quantities stand still for want of data, and a rule over fewer sessions takes that
 for convergence.
 
-Run as ``python -m i2rl.analysis.benchmarks.statistics.stopping``; ``--reuse`` judges the streams of the last
+Run as ``python -m i2rl.analysis.benchmarks.online.stopping``; ``--reuse`` judges the streams of the last
 run again.
 """
 

@@ -1,6 +1,6 @@
 """Error of online learning against batch, by what is kept: visits of seen steps, or the likelihood itself.
 
-``python -m i2rl.analysis.benchmarks.statistics.kept_likelihood`` learns a chain of six states (steps fail in
+``python -m i2rl.analysis.benchmarks.online.kept_likelihood`` learns a chain of six states (steps fail in
 three cases of ten) from 128 trajectories of 16 steps, one a session, with the actions unseen or flipped in 35
 of 100 cases; and patrol 2 at 30 % in view from 60 trajectories of 60 steps, also with a third of the actions
 misread. It prints mean and largest policy errors (the largest difference of an action's probability; on

@@ -21,7 +21,7 @@ true weights, which lie in [0, 1]^K:
 the default statistic it is 0.1 nats, which meets the default constant (0.002) in session 50; again with ten
 times less and more.
 
-Run as ``python -m i2rl.analysis.benchmarks.statistics.regret``.
+Run as ``python -m i2rl.analysis.benchmarks.online.regret``.
 """
 
 from __future__ import annotations
