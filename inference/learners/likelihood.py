@@ -207,13 +207,13 @@ def likelihood_learner(
         if not np.isfinite(own):
             require_possible(method.sensor, mdp, demonstration)
             raise DemonstrationError("a trajectory has probability zero under the current policy")
-        held = everything.n_trajectories, int(everything.lengths.sum())
-        if is_raw and (held[0] < RAW_TRAJECTORIES or held[1] < RAW_STEPS):
+        number = int((everything.lengths > 0).sum())
+        if is_raw and (number < RAW_TRAJECTORIES or everything.lengths.sum() < RAW_STEPS):
             new = bare._replace(raw=everything)
         else:
             new = _expanded(method, bare, model, end.weights, end.values, padded)
             new = new._replace(raw=none)  # of NumPy's arrays, as before
-        size = float(kept.size) + everything.n_trajectories
+        size = float(kept.size) + number
         info = SessionInfo(
             session=int(given.session) + 1,
             log_likelihood=float(total) / max(size, 1.0),

@@ -53,9 +53,7 @@ def fleet(learner: Learner) -> Fleet:
     ((4, 2), [1, 1, 1, 1])
     """
     if learner.session is None:
-        raise ValueError(
-            f"{learner.name} solves its programs outside JAX, so it cannot be mapped over streams"
-        )
+        raise ValueError(f"{learner.name} runs in part outside JAX, so it cannot be mapped over streams")
     session = learner.session
 
     @jax.jit
@@ -103,7 +101,7 @@ def run_streams(
     ((2, 2), [[1, 2], [1, 2]])
     """
     if learner.session is None:
-        raise ValueError(f"{learner.name} solves its programs outside JAX, so it cannot run compiled streams")
+        raise ValueError(f"{learner.name} runs in part outside JAX, so it cannot run compiled streams")
     shape = np.shape(demonstrations.kind)
     if len(shape) != 4:
         raise ValueError(f"streams need arrays [streams, sessions, trajectories, steps], got {list(shape)}")
