@@ -45,7 +45,7 @@ def empirical_bernstein(values: Float[np.ndarray, "... n K"], delta: float) -> I
     """
     values = _in_unit_interval(values, least=2)
     n = values.shape[-2]
-    log = _log(delta / 2)
+    log = _log(delta) + np.log(2)  # of each of two sides
     half = np.sqrt(2 * values.var(axis=-2, ddof=1) * log / n) + 7 * log / (3 * (n - 1))
     return Interval(values.mean(axis=-2), half)
 

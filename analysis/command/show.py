@@ -82,7 +82,7 @@ def _print_history(view: JournalView, records: list[SessionRecord]) -> None:
         return
     table = Table(title=f"Last {len(records)} sessions")
     formats = {"log_likelihood": ".4f", "iterations": ".0f", "seconds": ".4f"}
-    titles = {"log_likelihood": "log-likelihood (nats/trajectory)", "iterations": "EM steps"}
+    titles = {"log_likelihood": "log-likelihood (nats/trajectory)", "iterations": "steps"}
     shown = [name for name in formats if name in records[-1].info]
     for column in ("session", *(titles.get(name, name) for name in shown)):
         table.add_column(column, justify="right")

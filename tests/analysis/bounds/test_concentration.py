@@ -117,10 +117,11 @@ def test_values_outside_the_unit_interval_are_refused():
         empirical_bernstein(np.array([[0.0], [3.0]]), 0.1)
 
 
-@pytest.mark.parametrize("delta", [0.0, 1.0, -1.0, float("nan")])
-def test_a_failure_probability_outside_zero_and_one_is_refused(delta):
+@pytest.mark.parametrize("interval", [empirical_bernstein, predictable_bernstein])
+@pytest.mark.parametrize("delta", [0.0, 1.0, 1.5, -1.0, float("nan")])
+def test_a_failure_probability_outside_zero_and_one_is_refused(interval, delta):
     with pytest.raises(ValueError, match="strictly between 0 and 1"):
-        predictable_bernstein(np.zeros((3, 1)), delta)
+        interval(np.zeros((3, 1)), delta)
 
 
 def test_an_error_that_is_not_positive_is_refused():
