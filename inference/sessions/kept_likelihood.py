@@ -72,6 +72,7 @@ class KeptLikelihood(NamedTuple):
     raw: Demonstration
 
 
+@shown_briefly
 class Surrogate(NamedTuple):
     """The model in a session: visits, and a quadratic function around ``weights``.
 
