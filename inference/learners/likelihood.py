@@ -20,14 +20,11 @@ from jaxtyping import Array, Bool, Float, Int
 from ...models.inputs.arguments import as_key
 from ...models.observation.demonstration import Demonstration, DemonstrationError, concatenate
 from ...models.observation.evidence import checked_demonstration, require_possible
-from ...models.process.mdp import TabularMDP
-from ...models.process.planning import reward_of, soft_plan
 from ..completion.smoothing import Evidence, evidence_of, log_likelihoods
 from ..sessions.kept_likelihood import (
     KeptLikelihood,
     Surrogate,
     expanded,
-    log_policy_of,
     model_log_likelihood,
     nothing_kept,
     surrogate,
@@ -42,75 +39,70 @@ RAW_TRAJECTORIES, RAW_STEPS = 8, 500
 RAW_ITERATIONS, ITERATIONS = 30, 3
 # Length of a step in scaled weights, and the lengths tried, each half of the one before.
 _LONGEST_STEP = 1.0
-_HALVINGS = 14
+_LENGTHS = 14
 
 
-class _Climb(NamedTuple):
-    """A point of the climb to the session's weights."""
+class _Iterate(NamedTuple):
+    """A point on the way to the session's weights."""
 
     weights: Float[Array, " K"]
     values: Float[Array, " S"]
-    step: Float[Array, ""]
+    change: Float[Array, ""]
     gradient: Float[Array, ""]
     iterations: Int[Array, ""]
 
 
-def _plan_values(
-    mdp: TabularMDP, weights: Float[Array, " K"], values: Float[Array, " S"]
-) -> Float[Array, " S"]:
-    return soft_plan(mdp, reward_of(mdp, weights), values).values
-
-
-def _climbed(
+def _maximise(
     method: Method,
     model: Surrogate,
     evidence: Evidence,
-    start: _Climb,
+    start: _Iterate,
     iterations: Int[Array, ""],
     tolerance: float,
-) -> _Climb:
-    """Maximise what is kept and the likelihood of the evidence, less the prior."""
+) -> _Iterate:
+    """Maximise what is kept and the likelihood of the evidence, less the prior, by damped Newton steps."""
     mdp, ridge = method.mdp, method.ridge
 
     def objective(weights: Float[Array, " K"], values: Float[Array, " S"]) -> Float[Array, ""]:
-        log_policy = log_policy_of(mdp, weights, values)
+        log_policy = method.plan(weights, values).log_policy
         now = jnp.sum(log_likelihoods(mdp, log_policy, evidence))
         return model_log_likelihood(mdp, model, weights, log_policy) + now - ridge / 2 * weights @ weights
 
-    def slopes(weights: Float[Array, " K"], values: Float[Array, " S"]) -> tuple[Array, tuple[Array, Array]]:
-        height, slope = jax.value_and_grad(objective)(weights, values)
-        return slope, (height, slope)
+    def gradients(
+        weights: Float[Array, " K"], values: Float[Array, " S"]
+    ) -> tuple[Array, tuple[Array, Array]]:
+        value, gradient = jax.value_and_grad(objective)(weights, values)
+        return gradient, (value, gradient)
 
-    def step(now: _Climb) -> _Climb:
-        bend, (height, slope) = jax.jacfwd(slopes, has_aux=True)(now.weights, now.values)
-        spectrum, vectors = jnp.linalg.eigh(-(bend + bend.T) / 2)
-        ahead = vectors @ ((vectors.T @ slope) / jnp.maximum(jnp.abs(spectrum), 1e-6))
-        ahead *= jnp.minimum(1.0, _LONGEST_STEP / jnp.maximum(jnp.linalg.norm(ahead), 1e-300))
+    def step(now: _Iterate) -> _Iterate:
+        hessian, (value, gradient) = jax.jacfwd(gradients, has_aux=True)(now.weights, now.values)
+        eigenvalues, vectors = jnp.linalg.eigh(-(hessian + hessian.T) / 2)
+        direction = vectors @ ((vectors.T @ gradient) / jnp.maximum(jnp.abs(eigenvalues), 1e-6))
+        direction *= jnp.minimum(1.0, _LONGEST_STEP / jnp.maximum(jnp.linalg.norm(direction), 1e-300))
 
         def halve(at: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-            share, _, tried = at
-            reached = objective(now.weights + share / 2 * ahead, now.values)
-            climbs = reached >= height + 1e-4 * share / 2 * (slope @ ahead) - 1e-12 * jnp.abs(height)
-            return share / 2, climbs, tried + 1
+            scale, tried = at[0] / 2, at[2] + 1
+            reached = objective(now.weights + scale * direction, now.values)
+            rises = reached >= value + 1e-4 * scale * (gradient @ direction) - 1e-12 * jnp.abs(value)
+            return scale, rises, tried
 
-        share, found, _ = lax.while_loop(
-            lambda at: ~at[1] & (at[2] < _HALVINGS),
+        scale, found, _ = lax.while_loop(
+            lambda at: ~at[1] & (at[2] < _LENGTHS),
             halve,
             (jnp.array(2.0), jnp.array(False), jnp.zeros((), int)),
         )
-        moved = jnp.where(found, share, 0.0) * ahead
+        moved = jnp.where(found, scale, 0.0) * direction
         weights = now.weights + moved
-        gradient = jnp.where(now.iterations == 0, jnp.linalg.norm(slope + ridge * now.weights), now.gradient)
-        return _Climb(
+        return _Iterate(
             weights,
-            _plan_values(mdp, weights, now.values),
+            method.plan(weights, now.values).values,
             jnp.max(jnp.abs(moved)),
-            gradient,
+            jnp.where(now.iterations == 0, jnp.linalg.norm(gradient + ridge * now.weights), now.gradient),
             now.iterations + 1,
         )
 
-    def goes_on(now: _Climb) -> Bool[Array, ""]:
-        return (now.iterations < iterations) & (now.step > tolerance)
+    def goes_on(now: _Iterate) -> Bool[Array, ""]:
+        return (now.iterations < iterations) & (now.change > tolerance)
 
     return lax.while_loop(goes_on, step, start)
 
@@ -124,15 +116,15 @@ def _learned(
     weights: Float[Array, " K"],
     values: Float[Array, " S"],
     demonstration: Demonstration,
-) -> tuple[_Climb, Surrogate, Float[Array, ""], Float[Array, " n"]]:
+) -> tuple[_Iterate, Surrogate, Float[Array, ""], Float[Array, " n"]]:
     """Return the session's end, what it was kept by, and the log-likelihood of all and of each trajectory."""
     mdp = method.mdp
     evidence = evidence_of(mdp, method.sensor, demonstration)
     far = jnp.array(jnp.inf)
-    begun = _Climb(weights, _plan_values(mdp, weights, values), far, far, jnp.zeros((), int))
+    begun = _Iterate(weights, method.plan(weights, values).values, far, far, jnp.zeros((), int))
     model = surrogate(mdp, kept, values)
-    end = _climbed(method, model, evidence, begun, iterations, tolerance)
-    log_policy = log_policy_of(mdp, end.weights, end.values)
+    end = _maximise(method, model, evidence, begun, iterations, tolerance)
+    log_policy = method.plan(end.weights, end.values).log_policy
     each = log_likelihoods(mdp, log_policy, evidence)
     return end, model, model_log_likelihood(mdp, model, end.weights, log_policy) + jnp.sum(each), each
 
@@ -160,7 +152,7 @@ def _log_likelihood(
 ) -> Float[Array, ""]:
     mdp = method.mdp
     model = surrogate(mdp, kept, values)
-    log_policy = log_policy_of(mdp, weights, values)
+    log_policy = method.plan(weights, values).log_policy
     total, size = model_log_likelihood(mdp, model, weights, log_policy), kept.size
     if raw is not None:
         evidence = evidence_of(mdp, method.sensor, raw)
@@ -221,7 +213,7 @@ def likelihood_learner(
             gradient=float(end.gradient) / max(size, 1.0),
             iterations=int(end.iterations),
             solver_iterations=int(end.iterations),
-            converged=bool(end.step <= tolerance),
+            converged=bool(end.change <= tolerance),
             seconds=time.perf_counter() - began,
             weights=np.asarray(end.weights),
         )

@@ -215,15 +215,16 @@ def _with_kept_likelihood(
         )
     if slack is not None and (callable(slack) or slack != 0):
         raise ValueError("the likelihood statistic has no slack: give a ridge instead")
-    iterations = alternation.get("iterations", ITERATIONS)
-    tolerance = alternation.get("tolerance", 1e-6)
+    given = Alternation(**alternation)
+    iterations = given.iterations if "iterations" in alternation else ITERATIONS
+    tolerance = given.tolerance if "tolerance" in alternation else 1e-6
     if iterations < 1:
         raise ValueError(f"a session needs at least one iteration, got {iterations}")
 
     def build(mdp: TabularMDP) -> Learner:
-        method = checked_method(
-            mdp, sensor, "counts", "exact", 0.0, DEFAULT_KEPT_RIDGE if ridge is None else ridge, 0
-        )
+        # Of the method's parts only process, sensor and ridge are used.
+        precision = DEFAULT_KEPT_RIDGE if ridge is None else ridge
+        method = checked_method(mdp, sensor, "counts", "exact", 0.0, precision, 0)
         configuration = {
             "statistic": "likelihood",
             "ridge": method.ridge,
@@ -241,8 +242,11 @@ def lme_i2rl_with_random_weights(
 ) -> Learner[LMEState, SessionInfo]:
     """Build LME-I2RL without carried weights: every session starts from random ones (section 7.3).
 
-    It is a control for the value of carrying the weights. Options as for :func:`lme_i2rl`.
+    It is a control for the value of carrying the weights. Options as for :func:`lme_i2rl`, except the
+    ``likelihood`` statistic, which belongs to the weights that it was expanded at.
     """
+    if options.get("statistic") == "likelihood":
+        raise ValueError("the likelihood statistic is expanded at the carried weights: use lme_i2rl")
     sensor = fitting_sensor(sensor, mdp)
     carried = lme_i2rl(mdp, sensor, name="LME-I2RL with random weights", **options)
     configuration = carried.configuration
@@ -253,7 +257,7 @@ def lme_i2rl_with_random_weights(
             sensor,
             configuration["statistic"],
             configuration["completion"],
-            options.get("slack", DEFAULT_SLACK),
+            DEFAULT_SLACK if options.get("slack") is None else options["slack"],
             configuration["ridge"],
             configuration["draws"],
         )

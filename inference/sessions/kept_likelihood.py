@@ -76,16 +76,16 @@ class KeptLikelihood(NamedTuple):
 class Surrogate(NamedTuple):
     """The model in a session: visits, and a quadratic function around ``weights``.
 
-    ``share`` is ``rho``, ``bend`` the information ``F`` of all completed visits.
+    ``share`` is ``rho``, ``completed_information`` is ``F``.
     """
 
     visits: Float[Array, "S A"]
     weights: Float[Array, " K"]
     value: Float[Array, ""]
-    slope: Float[Array, " K"]
+    gradient: Float[Array, " K"]
     curvature: Float[Array, "K K"]
     share: Float[Array, ""]
-    bend: Float[Array, "K K"]
+    completed_information: Float[Array, "K K"]
 
 
 def nothing_kept(mdp: TabularMDP, raw: Demonstration) -> KeptLikelihood:
@@ -123,21 +123,21 @@ def surrogate(mdp: TabularMDP, kept: KeptLikelihood, values: Float[Array, " S"])
     def shape(theta: Float[Array, " K"]) -> Float[Array, "1"]:
         return visits_log_likelihood(mdp, kept.completed, log_policy_of(mdp, theta, values))[None]
 
-    (height,), (slope,), (hessian,) = _derivatives(shape, kept.weights)
-    bend = -_symmetric(hessian)
+    (value,), (gradient,), (hessian,) = _derivatives(shape, kept.weights)
+    information = -_symmetric(hessian)
     floored = _floored(kept.information, kept.convex)
-    shares = _shares(floored, convex_part(bend))
+    shares = _shares(floored, _convex_part(information))
     least = jnp.min(shares)
     share = least + (jnp.mean(shares) - least) / (1 + kept.sessions / _SETTLED)
     share = jnp.where(kept.sessions > 0, share, 0.0)
     return Surrogate(
         kept.exact + share * kept.completed,
         kept.weights,
-        kept.value - share * height,
-        kept.gradient - share * slope,
-        convex_part(floored - share * bend),
+        kept.value - share * value,
+        kept.gradient - share * gradient,
+        _convex_part(floored - share * information),
         share,
-        bend,
+        information,
     )
 
 
@@ -146,7 +146,7 @@ def model_log_likelihood(
 ) -> Float[Array, ""]:
     """Return the log-likelihood of everything kept, in nats."""
     d = weights - model.weights
-    quadratic = model.value + model.slope @ d - d @ model.curvature @ d / 2
+    quadratic = model.value + model.gradient @ d - d @ model.curvature @ d / 2
     return visits_log_likelihood(mdp, model.visits, log_policy) + quadratic
 
 
@@ -176,9 +176,9 @@ def expanded(
             ]
         )
 
-    (value, _), (score, slope), (hessian, bend) = _derivatives(both, weights)
+    (value, _), (score, gradient), (hessian, other) = _derivatives(both, weights)
     information = -_symmetric(hessian)
-    bent = model.share * (-_symmetric(bend) - model.bend)
+    change = model.share * (-_symmetric(other) - model.completed_information)
     before = model_log_likelihood(mdp, model, weights, log_policy)
     d = weights - model.weights
     return KeptLikelihood(
@@ -187,9 +187,9 @@ def expanded(
         kept.completed + others,
         weights,
         before - visits_log_likelihood(mdp, kept.exact, log_policy) + value,
-        model.share * slope + model.slope - model.curvature @ d + score,
-        kept.information + bent + information,
-        kept.convex + convex_part(bent) + convex_part(information),
+        model.share * gradient + model.gradient - model.curvature @ d + score,
+        kept.information + change + information,
+        kept.convex + _convex_part(change) + _convex_part(information),
         kept.sessions + 1,
         kept.raw,
     )
@@ -207,7 +207,7 @@ def _derivatives(function: Callable[[Array], Array], at: Float[Array, " K"]) -> 
     return value, slopes, second
 
 
-def convex_part(matrix: Float[Array, "K K"]) -> Float[Array, "K K"]:
+def _convex_part(matrix: Float[Array, "K K"]) -> Float[Array, "K K"]:
     """Return the nearest positive semidefinite matrix: negative eigenvalues become zero."""
     values, vectors = jnp.linalg.eigh(_symmetric(matrix))
     return (vectors * jnp.maximum(values, 0.0)) @ vectors.T
@@ -230,8 +230,8 @@ def _floored(information: Float[Array, "K K"], convex: Float[Array, "K K"]) -> F
     return root @ ((vectors * jnp.maximum(values, _FLOOR)) @ vectors.T) @ root
 
 
-def _shares(information: Float[Array, "K K"], bend: Float[Array, "K K"]) -> Float[Array, " K"]:
-    """Return the shares of the information in the completed visits' own, between 0 and 1."""
-    largest = jnp.maximum(jnp.max(jnp.linalg.eigvalsh(bend)), 1e-9)
-    _, inverse = _square_roots(bend, 1e-9 * largest)
+def _shares(information: Float[Array, "K K"], completed: Float[Array, "K K"]) -> Float[Array, " K"]:
+    """Return the shares of the information in that of the completed visits, between 0 and 1."""
+    largest = jnp.maximum(jnp.max(jnp.linalg.eigvalsh(completed)), 1e-9)
+    _, inverse = _square_roots(completed, 1e-9 * largest)
     return jnp.clip(jnp.linalg.eigvalsh(_symmetric(inverse @ information @ inverse)), 0.0, 1.0)

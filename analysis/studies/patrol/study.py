@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -214,12 +214,13 @@ def patrol_study(
     weights = learned[first][0].weights
     # The directions that the first replication's demonstrations determine, for each patroller learned.
     known = data[0] if first not in (RANDOM, TRUE) else ()
-    # Learning was timed alone; what follows is not timed, and takes turns with itself.
+    # Learning was timed alone; nothing below is timed.
     with _threads() as pool:
-        judged = {
-            name: pool.submit(_evaluated, patrol, observability, name, learned[name], keys, sessions, trials)
-            for name in names[:1]
-        }
+
+        def judge(name: str) -> Future[MethodResult]:
+            return pool.submit(_evaluated, patrol, observability, name, learned[name], keys, sessions, trials)
+
+        judged = {first: judge(first)}  # compiles what the others run
         stretch = pool.submit(_stretch, jax.random.fold_in(keys[0], 7), patrol, observability, weights[0, -1])
         determined = pool.submit(
             lambda: tuple(
@@ -233,10 +234,7 @@ def patrol_study(
         stretched = pool.submit(
             _likelihoods, patrol, observability, STRETCHES[:, None] * np.asarray(patrol.weights)
         )
-        for name in names[1:]:
-            judged[name] = pool.submit(
-                _evaluated, patrol, observability, name, learned[name], keys, sessions, trials
-            )
+        judged |= {name: judge(name) for name in names[1:]}
         results: list[MethodResult] = []
         for name in names:
             advance(f"breaching: {name}", 0.5 + len(results) / (2 * len(names)))

@@ -10,8 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from i2rl.analysis.benchmarks.online.kept_likelihood import chain
 from i2rl.inference import Journal, batch_lme, fit_counts, lme_i2rl, run_sessions
 from i2rl.inference.completion.smoothing import evidence_of, log_likelihoods
+from i2rl.inference.learners.lme import lme_i2rl_with_random_weights
 from i2rl.inference.sessions.kept_likelihood import (
     exact_steps,
     log_policy_of,
@@ -22,7 +24,6 @@ from i2rl.models import (
     Demonstration,
     DemonstrationError,
     FeatureNoise,
-    TabularMDP,
     TrajectoryLaw,
     Visibility,
     concatenate,
@@ -32,20 +33,9 @@ from i2rl.models import (
 from i2rl.models.observation.demonstration import LOST
 
 KEY = jax.random.key(0)
+CHAIN = chain()
 STEPS, RIDGE, TRUTH = 16, 0.02, np.array([0.0, 1.5])
-STATES = 6
-
-
-@cache
-def chain() -> TabularMDP:
-    """Build six states in a row, steps that fail in three cases of ten, and a reward for either end."""
-    here, slip = np.arange(STATES), 0.3
-    aims = np.stack([np.maximum(here - 1, 0), np.minimum(here + 1, STATES - 1)], axis=1)
-    successors = np.stack([aims, aims[:, ::-1]], axis=2)
-    features = np.zeros((STATES, 2, 2))
-    features[0, :, 0] = features[-1, :, 1] = 1
-    probabilities = np.broadcast_to([1 - slip, slip], successors.shape)
-    return TabularMDP.from_successors(successors, probabilities, features, discount=0.9)
+STATES = CHAIN.n_states
 
 
 @cache
@@ -55,7 +45,7 @@ def flipped() -> FeatureNoise:
 
 
 def demonstrated(sensor, n: int, seed: int = 0) -> Demonstration:
-    law = TrajectoryLaw(chain(), TRUTH, sensor, STEPS)
+    law = TrajectoryLaw(CHAIN, TRUTH, sensor, STEPS)
     return Demonstration.from_codes(np.asarray(law.sample(jax.random.key(seed), (n,))))
 
 
@@ -65,17 +55,17 @@ def whole() -> Visibility:
 
 @cache
 def learner():
-    return lme_i2rl(chain(), flipped(), statistic="likelihood")
+    return lme_i2rl(CHAIN, flipped(), statistic="likelihood")
 
 
 def policy_error(weights) -> float:
-    ours, truth = (soft_plan(chain(), reward_of(chain(), jnp.asarray(w))).policy for w in (weights, TRUTH))
+    ours, truth = (soft_plan(CHAIN, reward_of(CHAIN, jnp.asarray(w))).policy for w in (weights, TRUTH))
     return float(jnp.max(jnp.abs(ours - truth)))
 
 
 @cache
 def exact_learner():
-    return lme_i2rl(chain(), whole(), statistic="likelihood")
+    return lme_i2rl(CHAIN, whole(), statistic="likelihood")
 
 
 @pytest.mark.parametrize("lost", [False, True])
@@ -92,37 +82,40 @@ def test_what_is_read_exactly_or_lost_throughout_is_learned_as_in_batch(lost):
         )
         shown = concatenate([kept, gone])
     run = run_sessions(exact_learner(), shown.sessions(32), key=KEY)
-    expected = fit_counts(chain(), jnp.asarray(visits), 0.0, RIDGE).weights
+    expected = fit_counts(CHAIN, jnp.asarray(visits), 0.0, RIDGE).weights
     np.testing.assert_allclose(run.state.weights, expected, rtol=1e-7)
 
 
-def test_what_is_kept_has_the_derivatives_of_the_exact_log_likelihood():
-    shown = demonstrated(flipped(), 32)
-    state, info = learner().update(learner().init(KEY), shown)
+@pytest.mark.parametrize("hidden", [False, True])
+def test_what_is_kept_has_the_derivatives_of_the_exact_log_likelihood(hidden):
+    sensor = flipped() * Visibility(np.array([1, 1, 0, 0, 1, 1])) if hidden else flipped()
+    shown = demonstrated(sensor, 32)
+    online = lme_i2rl(CHAIN, sensor, statistic="likelihood")
+    state, info = online.update(online.init(KEY), shown)
     kept, at = state.statistic, state.weights
     assert len(kept.raw.kind) == 0  # expanded
-    evidence = evidence_of(chain(), flipped(), shown)
+    evidence = evidence_of(CHAIN, sensor, shown)
 
     def exact(weights):
-        return jnp.sum(log_likelihoods(chain(), log_policy_of(chain(), weights, state.values), evidence))
+        return jnp.sum(log_likelihoods(CHAIN, log_policy_of(CHAIN, weights, state.values), evidence))
 
-    model = surrogate(chain(), kept._replace(raw=None), state.values)
-    there = log_policy_of(chain(), at, state.values)
-    np.testing.assert_allclose(model_log_likelihood(chain(), model, at, there), exact(at), rtol=1e-10)
+    model = surrogate(CHAIN, kept._replace(raw=None), state.values)
+
+    def kept_at(weights):
+        return model_log_likelihood(CHAIN, model, weights, log_policy_of(CHAIN, weights, state.values))
+
+    np.testing.assert_allclose(kept_at(at), exact(at), rtol=1e-10)
     np.testing.assert_allclose(info.log_likelihood * 32, exact(at), rtol=1e-9)
-    slope = jax.grad(
-        lambda w: model_log_likelihood(chain(), model, w, log_policy_of(chain(), w, state.values))
-    )(at)
-    np.testing.assert_allclose(slope, jax.grad(exact)(at), atol=1e-8)
+    np.testing.assert_allclose(jax.grad(kept_at)(at), jax.grad(exact)(at), atol=1e-8)
     np.testing.assert_allclose(kept.information, -jax.jacfwd(jax.grad(exact))(at), atol=1e-8)
-    assert not np.asarray(exact_steps(chain(), evidence)).any()
+    assert not np.asarray(exact_steps(CHAIN, evidence)).any()
     assert float(kept.completed.sum()) == pytest.approx(32 * STEPS)
 
 
 def test_wrong_readings_cost_an_online_learner_no_more_than_batch():
     errors = {"likelihood": [], "seen": [], "batch": []}
-    seen = lme_i2rl(chain(), flipped(), slack=0.0, ridge=RIDGE)
-    batch = batch_lme(chain(), flipped(), slack=0.0, ridge=RIDGE, restarts=1)
+    seen = lme_i2rl(CHAIN, flipped(), slack=0.0, ridge=RIDGE)
+    batch = batch_lme(CHAIN, flipped(), slack=0.0, ridge=RIDGE, restarts=1)
     for seed in range(4):
         shown = demonstrated(flipped(), 192, seed)
         key = jax.random.key(seed)
@@ -164,7 +157,7 @@ def test_an_impossible_observation_is_named_and_leaves_the_state_as_it_was():
 
 def test_units_of_features_do_not_matter():
     scale = np.array([1e4, 1e-4])
-    other = replace(chain(), features=chain().features * scale)
+    other = replace(CHAIN, features=CHAIN.features * scale)
     shown = demonstrated(flipped(), 64)
     run = run_sessions(learner(), shown.sessions(32), key=KEY)
     scaled = lme_i2rl(other, flipped(), statistic="likelihood")
@@ -188,4 +181,11 @@ def test_units_of_features_do_not_matter():
 )
 def test_options_that_it_cannot_have_are_refused(options, message):
     with pytest.raises(ValueError, match=message):
-        lme_i2rl(chain(), whole(), statistic="likelihood", **options)
+        lme_i2rl(CHAIN, whole(), statistic="likelihood", **options)
+
+
+def test_an_unknown_option_is_refused_and_a_fresh_start_has_no_kept_likelihood():
+    with pytest.raises(TypeError, match="statistik"):
+        lme_i2rl(CHAIN, whole(), statistic="likelihood", statistik="seen")
+    with pytest.raises(ValueError, match="carried weights"):
+        lme_i2rl_with_random_weights(CHAIN, whole(), statistic="likelihood")
